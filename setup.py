@@ -93,9 +93,9 @@ setup(
     entry_points={
         'console_scripts': [
             f'slam-observer = {PACKAGE}.cli.main:main',
-            f'observer_node = {PACKAGE}.nodes.observer_node:main',
-            f'lifecycle_observer_node = {PACKAGE}.nodes.lifecycle_observer_node:main',
-            f'simulator_node = {PACKAGE}.nodes.simulator_node:main',
+            f'observer_node = {PACKAGE}.nodes.executables:observer_node',
+            f'lifecycle_observer_node = {PACKAGE}.nodes.executables:lifecycle_observer_node',
+            f'simulator_node = {PACKAGE}.nodes.executables:simulator_node',
             f'demo = {PACKAGE}.nodes.demo.demo:main',
         ],
     },

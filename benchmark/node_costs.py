@@ -37,7 +37,7 @@ OBSERVER, ALL_READ = 'observer_node', 'observer_node, all its topics read'
 BARE, ECHO, EVENTS_ECHO = 'bare subscriber', 'echo node', 'echo node, EventsExecutor'
 
 SUBJECT = [sys.executable, str(Path(__file__).with_name('node_subjects.py'))]
-NODE = [sys.executable, '-m', 'slam_observer_ros.nodes.observer_node', '--ros-args']
+NODE = [sys.executable, '-m', 'slam_observer_ros.nodes.executables', 'observer_node', '--ros-args']
 # Held back for nothing: the order is right, and the code is to be measured, not the wait.
 NODE += ['-p', 'reorder_window:=0.0']
 COMMANDS = {

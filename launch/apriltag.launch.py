@@ -11,7 +11,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from slam_observer_ros.nodes.launch_arguments import check_packages, numbers
+from slam_observer_ros.nodes.launch_setup import check_packages, numbers
 
 SHARE = FindPackageShare('slam_observer_ros')
 

@@ -11,14 +11,12 @@ from launch.substitutions import PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from slam_observer_ros.nodes.launch_arguments import (
+from slam_observer_ros.nodes.launch_setup import (
+    ARGUMENTS,
     check_file,
     check_optional_file,
     check_packages,
     is_true,
-)
-from slam_observer_ros.nodes.localization_setup import (
-    ARGUMENTS,
     parameters,
     remappings,
 )

@@ -6,7 +6,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from slam_observer_ros.nodes.launch_arguments import check_file
+from slam_observer_ros.nodes.launch_setup import check_file
 
 
 def generate_launch_description():

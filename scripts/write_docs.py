@@ -22,7 +22,7 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 
-from slam_observer_ros.nodes.plain_observer import ObserverNode
+from slam_observer_ros.nodes.observer_nodes import ObserverNode
 from slam_observer_ros.nodes.simulator import SimulatorNode
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import AUTO, InputSettings

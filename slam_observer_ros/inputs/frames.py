@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -45,25 +45,6 @@ def insert_transforms(
         )
 
 
-class TransformSource(Protocol):
-    """Where transforms come from."""
-
-    def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
-        """Return the pose (4, 4) of ``source`` in ``target``; TransformError if unknown then."""
-
-    def lookup_child(self, parent: str, child: str, stamp_ns: int) -> FloatArray:
-        """As ``lookup``, but what came with this parent, if others give the frame one, too."""
-
-    def parent_of(self, frame: str) -> str | None:
-        """Return the parent of a frame; None if it has none."""
-
-    def newest_ns(self, target: str, source: str) -> int | None:
-        """Return the newest stamp at which both frames are known, nanoseconds; None if never."""
-
-    def clear(self) -> None:
-        """Forget what has a time, after a jump of the clock."""
-
-
 class BaseFrame:
     """Brings measurements into the base frame, whose ``name`` it knows.
 
@@ -72,7 +53,7 @@ class BaseFrame:
     and so is an angle of ``sensor_pose`` beyond 2π, as those in degrees are.
     """
 
-    def __init__(self, settings: InputSettings, transforms: TransformSource) -> None:
+    def __init__(self, settings: InputSettings, transforms: TransformBuffer) -> None:
         settings = settings.with_plain_frames()
         self._transforms = transforms
         self.name = settings.base_frame

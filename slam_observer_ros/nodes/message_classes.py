@@ -1,4 +1,4 @@
-"""The classes of ROS messages, imported when a message of theirs is needed."""
+"""Classes of ROS messages, imported when they are needed, and the topics' qualities of service."""
 
 from __future__ import annotations
 
@@ -9,8 +9,15 @@ from importlib.util import find_spec
 import os
 from typing import Any
 
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.messages.outgoing import OutgoingMessages
+
+try:
+    from tf2_msgs.msg import TFMessage as TFMessage
+except ImportError:  # No wheel of it exists; scripts/build_tf2_msgs.py builds it.
+    TFMessage = None
 
 
 @cache
@@ -39,3 +46,13 @@ def install_command(package: str) -> str:
 
 MESSAGES = OutgoingMessages(message_class, lambda data: array('B', data))
 """Makes what the nodes publish."""
+
+
+RELIABLE_QOS = QoSProfile(depth=10)
+"""Out: any subscriber fits a reliable publisher."""
+
+LATCHED_POSE_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Out: as AMCL's pose; a late subscriber gets the last ones, as many as it keeps itself."""
+
+LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Out: a subscriber that comes late gets the last message."""

@@ -16,13 +16,12 @@ from rclpy.timer import Timer
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.nodes.entities import Entities
-from slam_observer_ros.nodes.guarded_node import GuardedNode
+from slam_observer_ros.nodes.guarded_node import Entities, GuardedNode
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
-from slam_observer_ros.nodes.intake.transform_listener import open_transforms
-from slam_observer_ros.nodes.intake.transformed_odometry import TransformedOdometry
+from slam_observer_ros.nodes.intake.transforms import LiveTransforms, TransformedOdometry
+from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
@@ -32,7 +31,6 @@ from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
 from slam_observer_ros.nodes.services.kept_pose import KeptPose
 from slam_observer_ros.nodes.services.map_services import MapServices
 from slam_observer_ros.nodes.services.named_map_services import NamedMapServices
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -71,9 +69,9 @@ class ObserverCore:
             judges_innovations=True,
         )
         # What comes in and what goes out
-        self._transforms = open_transforms(node, (settings.map_frame, settings.base_frame))
+        self._transforms = LiveTransforms(node, (settings.map_frame, settings.base_frame))
         self._feed = EstimatorFeed(
-            node, settings, self._estimator, BaseFrame(settings, self._transforms)
+            node, settings, self._estimator, BaseFrame(settings, self._transforms.buffer)
         )
         self._publisher = EstimatePublisher(node, settings, self._estimator, self._transforms)
         self._feed.on_events = self._publish_new
@@ -95,7 +93,7 @@ class ObserverCore:
             hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         # What others may do to the estimate
-        odometry = TransformedOdometry(settings, self._transforms)
+        odometry = TransformedOdometry(settings, self._transforms.buffer)
         controls = ControlServices(node, self._estimator, self._feed, self._publisher, odometry)
         self._maps = MapServices(node, settings, self._estimator, controls.note_move)
         NamedMapServices(node, self._maps)
@@ -254,7 +252,7 @@ class ObserverCore:
     def _on_estimator_jump(self) -> None:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""
         self._feed.clear()
-        self._transforms.clear()
+        self._transforms.buffer.clear()
         self._publisher.reset()
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:

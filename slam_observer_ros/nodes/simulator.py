@@ -16,15 +16,14 @@ from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
-from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.logs import ThrottledLog
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
+from slam_observer_ros.nodes.publishing.pose_broadcaster import TransformPublisher
 from slam_observer_ros.nodes.ros_parameters import (
     declare_settings,
     read_settings,
     RepeatableParameters,
 )
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
 

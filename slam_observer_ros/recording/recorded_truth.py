@@ -15,7 +15,7 @@ from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import IMPOSSIBLE_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.inputs.frames import TransformSource
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.pose_blocks import PoseBlock
 
@@ -139,7 +139,7 @@ def other_frames(base_frame: str, poses: Iterable[PoseBlock]) -> set[str]:
 
 
 def base_in_frames(
-    frames: Collection[str], base_frame: str, transforms: TransformSource
+    frames: Collection[str], base_frame: str, transforms: TransformBuffer
 ) -> dict[str, FloatArray]:
     """Return the pose (4, 4) of the base in each frame: identity, with a warning, if unknown."""
     base_in = dict.fromkeys(frames, np.eye(4))

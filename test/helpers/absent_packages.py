@@ -14,13 +14,20 @@ class Absent(importlib.abc.MetaPathFinder):
             raise ModuleNotFoundError(f'No module named {{name!r}}', name=name)
 
 sys.meta_path.insert(0, Absent())
-from {module} import main
-sys.exit(main())
+from {module} import {name}
+sys.exit({name}())
 """
 
 
-def program_without(absent: Collection[str], module: str, folder: Path) -> Path:
-    """Write a program that calls ``module.main`` where the packages ``absent`` are missing."""
-    path = folder / f'{module}.py'
-    path.write_text(PROGRAM.format(absent=tuple(absent), module=module))
+def program_without(
+    absent: Collection[str], module: str, folder: Path, name: str = 'main'
+) -> Path:
+    """Write a program that calls a function of a module where the packages ``absent`` miss."""
+    path = folder / f'{name}.py'
+    path.write_text(PROGRAM.format(absent=tuple(absent), module=module, name=name))
     return path
+
+
+def node_without(absent: Collection[str], name: str, folder: Path) -> Path:
+    """Write a program that runs a node likewise."""
+    return program_without(absent, 'slam_observer_ros.nodes.executables', folder, name)

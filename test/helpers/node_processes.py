@@ -48,7 +48,7 @@ class NodeProcess:
     ) -> None:
         """Start a node, or a program of its own in its place."""
         self.log = log
-        module = ['-m', f'slam_observer_ros.nodes.{name}']
+        module = ['-m', 'slam_observer_ros.nodes.executables', name]
         command = [sys.executable, *(module if program is None else [str(program)]), '--ros-args']
         always = ALL_ARE_USED if name in OBSERVERS else {}
         for key, value in (always | parameters).items():

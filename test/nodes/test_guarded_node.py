@@ -16,7 +16,7 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.nodes.guarded_node import _refusal
-from slam_observer_ros.nodes.managed_observer import LifecycleObserverNode
+from slam_observer_ros.nodes.observer_nodes import LifecycleObserverNode
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros
@@ -27,7 +27,7 @@ import numpy as np
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.observer_node import main
+from slam_observer_ros.nodes.executables import observer_node
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.services.control_services import ControlServices
 
@@ -54,7 +54,7 @@ Estimator.change_settings = fail
 Estimator.set_pose = fail
 ControlServices._forget = break_filter
 EstimatePublisher.publish_overview = fail
-sys.exit(main())
+sys.exit(observer_node())
 """
 
 HUBER = Parameter(

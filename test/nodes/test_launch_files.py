@@ -14,7 +14,7 @@ from unittest.mock import MagicMock
 from ament_index_python.packages import PackageNotFoundError
 import pytest
 
-from slam_observer_ros.nodes.launch_arguments import (
+from slam_observer_ros.nodes.launch_setup import (
     check_file,
     check_optional_file,
     check_packages,

@@ -6,7 +6,7 @@ import sys
 import time
 from unittest.mock import MagicMock
 
-from absent_packages import program_without
+from absent_packages import node_without
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -17,8 +17,8 @@ from rcl_interfaces.srv import SetParameters
 from robots import own_topics, Robot, stamp_ns
 from std_srvs.srv import Trigger
 
-from slam_observer_ros.nodes.bond import LifecycleBond
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+from slam_observer_ros.nodes.message_classes import TFMessage
+from slam_observer_ros.nodes.observer_nodes import LifecycleBond
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros
@@ -206,9 +206,7 @@ def test_an_own_start_that_fails_ends_the_process_with_the_reason(tmp_path):
 
 def test_a_bond_needs_bondpy(tmp_path):
     parameters = {'autostart_node': True, 'bond_heartbeat_period': 0.25}
-    program = program_without(
-        ['bondpy'], 'slam_observer_ros.nodes.lifecycle_observer_node', tmp_path
-    )
+    program = node_without(['bondpy'], 'lifecycle_observer_node', tmp_path)
     node = NodeProcess('', tmp_path / 'log', program=program, **parameters)
     assert node.wait() == 2
     assert "'bond_heartbeat_period' needs bondpy: apt install ros-" in node.output

@@ -22,9 +22,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.estimate_messages import EstimateMessages
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
-from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
-from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from absent_packages import program_without
+from absent_packages import node_without
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from node_processes import running
@@ -19,7 +19,7 @@ def node(tmp_path):
 
     def run(name, **parameters):
         absent = (*OPTIONAL_PACKAGES, 'threadpoolctl')
-        program = program_without(absent, f'slam_observer_ros.nodes.{name}', tmp_path)
+        program = node_without(absent, name, tmp_path)
         return running(name, tmp_path / 'log', program=program, **parameters)
 
     return run

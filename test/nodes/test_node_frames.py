@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -20,16 +19,13 @@ pytest.importorskip('tf2_msgs')
 from robots import own_topics, pose_of, Robot, stamp_ns, TransformSender
 from tf2_msgs.msg import TFMessage
 
-from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
-from slam_observer_ros.nodes.intake import transform_listener
-from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.intake.transforms import LiveTransforms
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
 from slam_observer_ros.simulation import Scenario, Simulation
 
 pytestmark = pytest.mark.ros
@@ -211,79 +207,16 @@ def _values(diagnostics):
     return {value.key: value.value for value in diagnostics[-1].status[0].values}
 
 
-class FakeBuffer:
-    """What tf2_ros.Buffer does, as far as it is used."""
-
-    def lookup_transform(self, target, source, time):
-        if source != 'camera':
-            raise LookupError(f'"{source}" does not exist')
-        stamped = TransformStamped()
-        stamped.transform.translation.x = float(time.nanoseconds)
-        stamped.transform.rotation.w = 1.0
-        return stamped
-
-    def get_latest_common_time(self, target, source):
-        if source not in ('camera', 'mast'):
-            raise LookupError(f'"{source}" does not exist')
-        return SimpleNamespace(nanoseconds=42 if source == 'camera' else 0)
-
-    def all_frames_as_yaml(self):
-        return "*eye:\n  parent: 'a: b'\ncamera: \n  broadcaster: 'x'\n  parent: 'mast'\n"
-
-    def clear(self):
-        """Forget nothing."""
-
-    def set_transform(self, stamped, authority):
-        """Take nothing."""
-
-
-def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
-    fake = SimpleNamespace(
-        Buffer=FakeBuffer, TransformListener=Mock(), TransformException=LookupError
-    )
-    monkeypatch.setattr(transform_listener, 'tf2_ros', fake)
-    node = Mock()
-    transforms = transform_listener.open_transforms(node, ('map', 'base'))
-    assert fake.TransformListener.call_args.args[1] is node
-    assert_allclose(transforms.lookup('base', 'camera', 42)[:3, 3], [42.0, 0.0, 0.0])
-    with pytest.raises(TransformError, match='does not exist'):
-        transforms.lookup('base', 'sonar', 42)
-    assert transforms.newest_ns('base', 'camera') == 42
-    assert transforms.newest_ns('base', 'mast') == ALWAYS_NS
-    assert transforms.newest_ns('base', 'sonar') is None
-    assert transforms.parent_of('camera') == 'mast'
-    assert transforms.parent_of('*eye') == 'a: b'
-    assert transforms.parent_of('mast') is None
-    transforms.clear()
-    transforms.on_transform = Mock()
-    header = MESSAGES.header(SECOND, 'map')
-    # As its listener does.
-    fake.TransformListener.call_args.args[0].set_transform(
-        TransformStamped(header=header, child_frame_id='odom'), 'default_authority'
-    )
-    transforms.on_transform.assert_called_once_with('map', 'odom', SECOND)
-    # tf2 would take the first of these alone.
-    for _ in range(2):
-        for number in (1, 2):
-            stamped = TransformStamped(header=MESSAGES.header(SECOND, f'cam{number}'))
-            stamped.child_frame_id = 'tag_7'
-            stamped.transform.translation.x = float(number)
-            fake.TransformListener.call_args.args[0].set_transform(stamped, 'default_authority')
-    for number in (1, 2):
-        pose = transforms.lookup_child(f'cam{number}', 'tag_7', SECOND)
-        assert_allclose(pose[:3, 3], [number, 0.0, 0.0])
-
-
 def test_the_nodes_own_transform_takes_no_other_ones_place():
     node = Mock()
-    transforms = transform_listener.TopicTransforms(node, ('map', 'base_link'))
+    transforms = LiveTransforms(node, ('map', 'base_link'))
     receive = node.create_subscription.call_args_list[0].args[2]
     for parent in ('odom', 'map'):
         header = MESSAGES.header(SECOND, parent)
         transform = TransformStamped(header=header, child_frame_id='base_link')
         receive(serialize_message(TFMessage(transforms=[transform])))
-    assert transforms.newest_ns('odom', 'base_link') == SECOND
-    assert transforms.newest_ns('map', 'base_link') is None
+    assert transforms.buffer.newest_ns('odom', 'base_link') == SECOND
+    assert transforms.buffer.newest_ns('map', 'base_link') is None
 
 
 def test_a_second_localisation_on_tf_is_named(ros, tmp_path):

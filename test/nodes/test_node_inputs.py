@@ -38,9 +38,7 @@ from slam_observer_ros.messages.poses_and_velocities import decode_twist
 from slam_observer_ros.nodes.intake import warning_decoders
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info
-from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
-from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 pytestmark = pytest.mark.ros

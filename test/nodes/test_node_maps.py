@@ -29,7 +29,7 @@ from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
-from slam_observer_ros.nodes.intake.transformed_odometry import TransformedOdometry
+from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.settings.estimator_settings import Settings

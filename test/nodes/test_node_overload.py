@@ -15,8 +15,8 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.nodes.intake.load_shedding import LoadShedding, Waiting
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+from slam_observer_ros.nodes.intake.load import LoadShedding, Waiting
+from slam_observer_ros.nodes.message_classes import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 pytestmark = pytest.mark.ros

@@ -27,11 +27,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
-from slam_observer_ros.nodes.message_classes import MESSAGES
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher, MANY_UNUSED
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
-from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros

@@ -23,7 +23,7 @@ SLOW_NODE = """\
 import sys
 import time
 from slam_observer_ros.association.hypotheses import Hypotheses
-from slam_observer_ros.nodes.observer_node import main
+from slam_observer_ros.nodes.executables import observer_node
 
 observe, seen = Hypotheses.observe, []
 
@@ -37,7 +37,7 @@ def slow(self, event):
     return observe(self, event)
 
 Hypotheses.observe = slow
-sys.exit(main())
+sys.exit(observer_node())
 """
 
 READY = {'observer_node': 'estimating', 'simulator_node': 'waiting|starts'}
@@ -106,8 +106,8 @@ def test_a_signal_while_the_interpreter_clears_up_does_not_end_it(tmp_path):
     program = tmp_path / 'program.py'
     program.write_text(
         'import signal, sys\n'
-        'from slam_observer_ros.nodes.observer_node import main\n'
-        'code = main()\n'
+        'from slam_observer_ros.nodes.executables import observer_node\n'
+        'code = observer_node()\n'
         'print([signal.getsignal(n) == signal.SIG_IGN for n in (signal.SIGINT, signal.SIGTERM)])\n'
         'sys.exit(code)\n'
     )

@@ -31,9 +31,7 @@ from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
-from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
-from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.simulation import Scenario, Simulation

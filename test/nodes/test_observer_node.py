@@ -31,9 +31,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
-from slam_observer_ros.nodes.message_classes import MESSAGES
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
 from slam_observer_ros.nodes.publishing.pose_broadcaster import DISCOVERY_S
-from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros

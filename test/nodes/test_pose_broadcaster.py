@@ -17,8 +17,8 @@ from slam_observer_ros.nodes.publishing.pose_broadcaster import (
     DISCOVERY_S,
     MAX_WAITING_NS,
     PoseBroadcaster,
+    TFMessage,
 )
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not installed')

@@ -11,7 +11,7 @@ import pytest
 
 from slam_observer_ros.nodes.demo import hall, robot
 from slam_observer_ros.nodes.demo.robot_report import Restart
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+from slam_observer_ros.nodes.message_classes import TFMessage
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 

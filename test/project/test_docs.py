@@ -24,7 +24,7 @@ from slam_observer_ros.cli.replay.summary import as_json
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
-from slam_observer_ros.nodes import localization_setup
+from slam_observer_ros.nodes import launch_setup
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.settings.parameter_table import table
@@ -120,8 +120,8 @@ def launch_arguments(file):
     if 'localization.launch.py' in texts:
         names |= launch_arguments('localization.launch.py')
     imported = {getattr(node, 'module', '') for node in tree.body}
-    if localization_setup.__name__ in imported:
-        names |= set(localization_setup.ARGUMENTS)
+    if launch_setup.__name__ in imported:
+        names |= set(launch_setup.ARGUMENTS)
     for node in tree.body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], 'id', '') == 'ARGUMENTS':
             names |= {key.value for key in node.value.keys}

@@ -14,8 +14,8 @@ from slam_observer_ros.common.threads import CHOICES
 NODE = """
 import sys
 sys.argv = ['observer_node', '--help']
-from slam_observer_ros.nodes.observer_node import main
-main()
+from slam_observer_ros.nodes.executables import observer_node
+observer_node()
 """
 COMMAND = """
 from slam_observer_ros.cli.main import main

@@ -172,7 +172,7 @@ def _simulator(options: argparse.Namespace, folder: Path) -> NodeContext:
 @contextmanager
 def _node(name: str, folder: Path, **parameters: object) -> Iterator[subprocess.Popen[bytes]]:
     """Run a node with its output in a file; stop it at the end."""
-    command = [sys.executable, '-m', f'slam_observer_ros.nodes.{name}', '--ros-args']
+    command = [sys.executable, '-m', 'slam_observer_ros.nodes.executables', name, '--ros-args']
     for key, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
         command += ['-p', f'{key}:={text}']

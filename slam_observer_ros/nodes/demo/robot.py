@@ -30,7 +30,7 @@ from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.nodes.demo.hall_robot import HallRobot, ODOMETRY_HZ
 from slam_observer_ros.nodes.demo.robot_report import report, Restart
-from slam_observer_ros.nodes.localization_setup import command_line, EXECUTABLE
+from slam_observer_ros.nodes.launch_setup import command_line, EXECUTABLE
 from slam_observer_ros.nodes.stop_signal import StopSignal
 from slam_observer_ros.settings.estimator_settings import Settings
 

@@ -30,9 +30,8 @@ from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_problem
 from slam_observer_ros.nodes.guarded_node import described
-from slam_observer_ros.nodes.intake.clock_change import ClockChange
-from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
+from slam_observer_ros.nodes.intake.clocks import ClockChange, ClockOffset
+from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.settings.input_settings import ON_TF
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

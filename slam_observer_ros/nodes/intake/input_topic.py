@@ -17,10 +17,9 @@ from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.nodes.intake.backlog import Backlog
-from slam_observer_ros.nodes.intake.load_shedding import LoadShedding, Waiting
+from slam_observer_ros.nodes.intake.load import Backlog, LoadShedding, Waiting
+from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import message_class
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.

@@ -1,8 +1,9 @@
-"""What the observer publishes about its estimate."""
+"""What the observer publishes about its estimate, and how often."""
 
 from __future__ import annotations
 
 from collections import deque
+import time
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -22,13 +23,47 @@ from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
 from slam_observer_ros.nodes.intake.input_topic import rivals
-from slam_observer_ros.nodes.intake.transform_listener import LiveTransforms
-from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.publishing.pace import Pace
+from slam_observer_ros.nodes.intake.transforms import LiveTransforms
+from slam_observer_ros.nodes.logs import ThrottledLog
+from slam_observer_ros.nodes.message_classes import (
+    LATCHED_POSE_QOS,
+    LATCHED_QOS,
+    MESSAGES,
+    RELIABLE_QOS,
+)
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
-from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_QOS
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+SLACK = 0.5
+"""Part of the period by which a state of the input that sets the pace may come early, as inputs
+jitter, and by which those of others wait for it."""
+
+
+class Pace:
+    """Allows a state at most at a rate, at the times at which one input gives them.
+
+    That is the one that gave the last. What others give in between comes out with its next: it
+    would take the turn of that, which would then wait for the one after it.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_s = 1.0 / rate_hz
+        self._due_s = 0.0  # by a steady clock
+        self._source = ''
+
+    def is_due(self, source: str) -> bool:
+        """Return whether a state may be published now, which an input gave; '' for none."""
+        slack_s = SLACK * self._period_s
+        sets_pace = bool(source) and source == self._source
+        return time.monotonic() >= self._due_s + (-slack_s if sets_pace else slack_s)
+
+    def note(self, source: str) -> None:
+        """Take that a state is published now, which an input gave."""
+        self._source = source or self._source
+        # One that is late for a moment puts off no other.
+        earliest_s = time.monotonic() + SLACK * self._period_s
+        self._due_s = max(self._due_s + self._period_s, earliest_s)
+
 
 TOPICS = (
     '~/odometry',
@@ -82,7 +117,7 @@ class EstimatePublisher:
         self._broadcaster: PoseBroadcaster | None = None
         if settings.publish_tf:
             self._broadcaster = PoseBroadcaster(
-                node, settings, transforms, estimator.settings.reorder_window
+                node, settings, transforms.buffer, estimator.settings.reorder_window
             )
             transforms.on_transform = self._broadcaster.hear
             transforms.is_own = self._broadcaster.is_own

@@ -12,8 +12,8 @@ from std_msgs.msg import Bool
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
+from slam_observer_ros.nodes.logs import ThrottledLog
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT = 300  # observations over which innovations are compared with the noise that is stated

@@ -6,16 +6,47 @@ from collections import deque
 import time
 
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import TransformSource
-from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
-from slam_observer_ros.nodes.qos import RELIABLE_QOS
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.state_messages import encode_transform
+from slam_observer_ros.nodes.logs import ThrottledLog
+from slam_observer_ros.nodes.message_classes import RELIABLE_QOS, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+SENT = 10  # messages that may be on their way back at once
+
+
+class TransformPublisher:
+    """Publishes single transforms on ``/tf``, or latched on ``/tf_static``.
+
+    Without tf2_msgs it logs so once and does nothing. ``sent`` are the last messages.
+    """
+
+    def __init__(self, node: Node, topic: str, qos: QoSProfile) -> None:
+        self.sent: deque[bytes] = deque(maxlen=SENT)
+        self._publisher = None
+        if TFMessage is None:
+            node.get_logger().warning(f'tf2_msgs is not installed: nothing goes out on {topic}')
+        else:
+            self._publisher = node.create_publisher(TFMessage, topic, qos)
+
+    @property
+    def can_publish(self) -> bool:
+        """Whether transforms go out."""
+        return self._publisher is not None
+
+    def publish(self, stamp_ns: int, parent: str, child: str, pose: FloatArray) -> None:
+        """Publish the pose (4, 4) of frame ``child`` in frame ``parent``."""
+        if self._publisher is not None:
+            message = encode_transform(stamp_ns, parent, child, pose)
+            self.sent.append(message)
+            self._publisher.publish(message)
+
 
 DISCOVERY_S = 2.0  # from the first pose on, before the base is taken to have no parent on /tf
 MAX_WAITING_NS = 10_000_000_000  # a pose waits for odometry as long as tf keeps transforms
@@ -38,7 +69,7 @@ class PoseBroadcaster:
     ----------
     node : Node
     settings : ObserverNodeSettings
-    transforms : TransformSource
+    transforms : TransformBuffer
         Where the odometry is, without what is published here.
     reorder_window_s : float
         How long poses are held back, seconds.
@@ -54,7 +85,7 @@ class PoseBroadcaster:
         self,
         node: Node,
         settings: ObserverNodeSettings,
-        transforms: TransformSource,
+        transforms: TransformBuffer,
         reorder_window_s: float,
     ) -> None:
         self._node = node

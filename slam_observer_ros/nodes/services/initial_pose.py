@@ -17,9 +17,9 @@ from slam_observer_ros.messages.poses_and_velocities import (
     decode_pose_with_covariance_stamped,
     PoseMessage,
 )
-from slam_observer_ros.nodes.intake.clock_offset import FUTURE_NS
-from slam_observer_ros.nodes.intake.transformed_odometry import TransformedOdometry
-from slam_observer_ros.nodes.qos import RELIABLE_QOS
+from slam_observer_ros.nodes.intake.clocks import FUTURE_NS
+from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
+from slam_observer_ros.nodes.message_classes import RELIABLE_QOS
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
 from slam_observer_ros.state.covariances import MAX_POSE_ERRORS, of_moved_pose
 

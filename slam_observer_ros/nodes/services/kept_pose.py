@@ -10,8 +10,8 @@ from rclpy.node import Node
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
 from slam_observer_ros.known_map.pose_file import read_pose, StoredPose, write_pose
+from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.services.map_services import absolute, is_there
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 

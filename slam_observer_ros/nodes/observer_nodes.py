@@ -1,4 +1,4 @@
-"""The SLAM observer as a managed node, whose start and stop others command."""
+"""The SLAM observer as a ROS 2 node: one that always estimates, and one that others command."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from typing import Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 
 from slam_observer_ros.common.errors import ParameterError, SlamObserverError
-from slam_observer_ros.nodes.bond import LifecycleBond
-from slam_observer_ros.nodes.entities import Entities
-from slam_observer_ros.nodes.log_bridge import forward_logging
+from slam_observer_ros.nodes.guarded_node import Entities
+from slam_observer_ros.nodes.logs import forward_logging
+from slam_observer_ros.nodes.message_classes import install_command
 from slam_observer_ros.nodes.observer_core import ObserverCore
 from slam_observer_ros.nodes.ros_parameters import (
     declare_settings,
@@ -20,6 +21,74 @@ from slam_observer_ros.nodes.ros_parameters import (
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ManagedNodeSettings, ObserverNodeSettings
+
+TOPIC = 'bond'
+TIMEOUT_S = 4.0
+"""After which without a heartbeat the manager is given up; as Nav2's own nodes have it."""
+
+
+class LifecycleBond:
+    """Heartbeats to the lifecycle manager while the node is active.
+
+    Raises a ParameterError where they are asked for, and bondpy is not installed.
+    """
+
+    def __init__(self, node: Node, heartbeat_period_s: float) -> None:
+        self._node = node
+        self._period_s = heartbeat_period_s
+        self._bond: Any = None
+        if heartbeat_period_s:
+            self._bond_class = _bond_class()
+
+    def start(self) -> None:
+        """Begin with the heartbeats, if they were asked for."""
+        if not self._period_s or self._bond is not None:
+            return
+        self._bond = self._bond_class(topic=TOPIC, id=self._node.get_name(), node=self._node)
+        self._bond.set_heartbeat_period(self._period_s)
+        self._bond.set_heartbeat_timeout(TIMEOUT_S)
+        self._bond.start()
+
+    def end(self) -> None:
+        """Let the manager know that they end on purpose."""
+        if self._bond is not None:
+            self._bond.shutdown()
+            self._bond = None
+
+
+def _bond_class() -> Any:
+    try:
+        from bondpy.bondpy import Bond
+    except ImportError as error:
+        raise ParameterError(
+            f"'bond_heartbeat_period' needs bondpy: {install_command('bondpy')}; or set it to 0, "
+            'and bond_timeout of the lifecycle manager to 0.0'
+        ) from error
+    return Bond
+
+
+class ObserverNode(RepeatableParameters):
+    """Estimates from its start to its end."""
+
+    def __init__(self) -> None:
+        super().__init__('observer_node')
+        self._core: ObserverCore | None = None  # till it is made: rclpy may end a node before
+        forward_logging(self.get_logger())
+        declare_settings(self, Settings, ObserverNodeSettings)
+        self._core = ObserverCore(self)
+        self._core.start()
+
+    def end_in_haste(self) -> int | None:
+        """See :meth:`.ObserverCore.end_in_haste`."""
+        return None if self._core is None else self._core.end_in_haste()
+
+    def destroy_node(self) -> None:
+        """Save the map if that was asked for, and end; raise a MapError if it can't be saved."""
+        try:
+            if self._core is not None:
+                self._core.close()
+        finally:
+            super().destroy_node()
 
 
 class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignore[misc]

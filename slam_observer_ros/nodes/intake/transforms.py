@@ -1,0 +1,122 @@
+"""What /tf has: transforms of others, live, and the odometry among them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.subscription import Subscription
+
+from slam_observer_ros.common.errors import MessageError, TransformError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.frames import insert_transforms
+from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
+from slam_observer_ros.messages.poses_and_velocities import decode_transforms
+from slam_observer_ros.nodes.intake.input_topic import take
+from slam_observer_ros.nodes.logs import ThrottledLog
+from slam_observer_ros.nodes.message_classes import TFMessage
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+TF_QOS = QoSProfile(depth=100)
+TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class LiveTransforms:
+    """Listens to /tf and /tf_static; without tf2_msgs no transform is ever known.
+
+    Parameters
+    ----------
+    node : Node
+    own : (str, str)
+        Parent and child of the transform that the node itself publishes where nobody else gives
+        the child a parent: heard back, it would replace another parent.
+
+    Attributes
+    ----------
+    buffer : TransformBuffer
+        What is known.
+    on_transform : callable
+        Called with parent, child and stamp, nanoseconds, of each transform on /tf.
+    is_own : callable
+        Says of a message on /tf whether it came from here; then it is not looked into.
+
+    """
+
+    def __init__(self, node: Node, own: tuple[str, str]) -> None:
+        self._node = node
+        self._own = own
+        self._log = ThrottledLog(node)
+        self.on_transform: Callable[[str, str, int], None] = _ignore
+        self.is_own: Callable[[bytes], bool] = _is_of_another
+        self.buffer = TransformBuffer()
+        self._dynamic: Subscription | None = None
+        if TFMessage is not None:
+            self._dynamic = self._subscribe('/tf', TF_QOS, is_static=False)
+            self._subscribe('/tf_static', TF_STATIC_QOS, is_static=True)
+
+    def read_waiting(self) -> None:
+        """Take what has come on /tf: while the node was busy, it may be a lot."""
+        if self._dynamic is None:
+            return
+        for _ in range(TF_QOS.depth):
+            taken = take(self._dynamic)
+            if taken is None:
+                return
+            self._dynamic.callback(taken[0])
+
+    def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> Subscription:
+        def receive(raw: bytes) -> None:
+            if self.is_own(raw):
+                return
+            try:
+                transforms = decode_transforms(raw)
+            except MessageError as error:
+                self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
+                return
+            if not is_static:
+                for each in transforms:
+                    self.on_transform(each.frame_id, each.child_frame_id, each.stamp_ns)
+            others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
+            insert_transforms(self.buffer, others, is_static=is_static)
+
+        return self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
+
+
+def _ignore(_parent: str, _child: str, _stamp_ns: int) -> None:
+    """Take no notice of a transform."""
+
+
+def _is_of_another(_raw: bytes) -> bool:
+    """Take each message to be of another publisher."""
+    return False
+
+
+class TransformedOdometry:
+    """Where the base is in ``odom_frame``, if that is on /tf."""
+
+    def __init__(self, settings: ObserverNodeSettings, transforms: TransformBuffer) -> None:
+        self._frames = settings.odom_frame, settings.base_frame
+        self._transforms = transforms
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Newest stamp, nanoseconds; None if there is no odometry that moves."""
+        newest_ns = self._transforms.newest_ns(*self._frames) if self._frames[0] else None
+        return None if newest_ns == ALWAYS_NS else newest_ns
+
+    def pose_until(self, stamp_ns: int) -> FloatArray | None:
+        """Return the pose (4, 4) of the base at a stamp, or the newest before; None if unknown."""
+        newest_ns = self.newest_ns
+        if newest_ns is None:
+            return None
+        try:
+            return self._transforms.lookup(*self._frames, min(stamp_ns, newest_ns))
+        except TransformError:
+            return None
+
+    def motion(self, start_ns: int, end_ns: int) -> FloatArray | None:
+        """Return how the base has moved (4, 4) between two stamps; None if that is not known."""
+        start, end = self.pose_until(start_ns), self.pose_until(end_ns)
+        return None if start is None or end is None else se3.inverse(start) @ end
