@@ -199,27 +199,31 @@ class Hypotheses:
 
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
-        if self.best.filter.has_joint_covariance:
-            event = self._without_carried(event)
+        standing = self._standing
+        if standing.is_due(event):
+            self._judge(event)
+        if standing.excluded:
+            event = event.without(standing.excluded)
         return self._observe(event)
 
-    def _without_carried(self, event: ObservationEvent) -> ObservationEvent:
-        """Stop where the wheels spin; return an observation without what the robot carries."""
-        standing = self._standing
-        if standing.carried:
-            event = event.without(standing.carried)
-        were_spinning, were_carried = standing.is_spinning, len(standing.carried)
-        lost = standing.note(self.best, event)
-        if lost is not None:
-            for hypothesis in self._all:
-                take_back(hypothesis.state, lost)
-                hypothesis.state.counts['slip'] += not were_spinning
-        if newly := len(standing.carried) - were_carried:
-            for landmark_id in standing.carried:
+    def _judge(self, event: ObservationEvent) -> None:
+        """Stop where the wheels spin, and give up landmarks that the robot carries."""
+        standing, best = self._standing, self.best
+        if not best.filter.has_joint_covariance:
+            return
+        was_slipping, were_carried = standing.slip is not None, standing.carried
+        lost = standing.note(best, event)
+        newly = standing.carried - were_carried
+        for hypothesis in self._all:
+            state = hypothesis.state
+            if lost is not None:
+                take_back(state, lost)
+                state.counts['slip'] += not was_slipping
+            if newly:
+                state.counts['carried_landmark'] += len(newly)
+        if best.is_mapping:
+            for landmark_id in newly:
                 self.forget(landmark_id)
-            for hypothesis in self._all:
-                hypothesis.state.counts['carried_landmark'] += newly
-        return event.without(standing.suspects) if standing.suspects else event
 
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""

@@ -1,20 +1,20 @@
 """What stands still in the robot's frame while odometry says that the robot drives on.
 
 If all does, the robot stands and its wheels spin, for as long as that lasts: each observation is
-off by too little to be rejected, and pose and landmarks would be dragged along. If some of it
-does while other landmarks pass as odometry has it, the robot carries them along: these are not
-places. A landmark bears witness to a standstill once it has been seen to pass, or if it is of a
-map that does not grow; till then it may be one that the robot carries.
+off by too little to be rejected, and pose and landmarks would be dragged along. So would they if
+it turns and slides. If some of it stands while other landmarks pass as odometry has it, the robot
+carries them along: these are not places.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
@@ -22,102 +22,167 @@ from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blo
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.state.state import State
 
-FIRST_TEST_NS, LAST_TEST_NS = to_ns(0.25), to_ns(2.0)
-"""When it is looked at what has passed, after its start, and for the last time."""
+TEST_NS, LONGEST_WAIT_NS = to_ns(0.25), to_ns(1.0)
+"""How often what is in view is compared with what was: at the most, and at least."""
+
+LAST_TEST_NS = to_ns(15.0)
+"""For how long it is compared with the same look, where it passes slowly."""
+
+SLIPS = (np.zeros(6), np.repeat([1.0, 0.0], 3))
+"""Shares (6,) of a motion that are made where wheels spin: nothing, or the turn alone."""
 
 NOISE = 3.0
-"""Standard deviations of what a sensor says, within which a landmark stands still."""
+"""Standard deviations of what a sensor says, within which a landmark is where it should be."""
+
+MOVED = 2.0
+"""Standard deviations from which on a landmark has hardly stood still."""
 
 CLEAR = 6.0
 """Standard deviations from which on a motion, or a shift in the robot's frame, is clear."""
 
-LEAST_WITNESSES = 2
-"""Landmarks that must agree on a standstill: one alone may move as the robot does."""
+USUAL = 4.0
+"""Standard deviations, in the mean, with which it is quickly seen what passes."""
+
+FORGOTTEN = 0.95
+"""What is left of the way that this took after each time, as the noise may be less now."""
+
+CERTAIN = 2.0 * CLEAR**2
+"""Evidence with which a landmark is carried, at most: two looks or more, −2 ln of a likelihood."""
+
+LEAST = 2
+"""Landmarks that must agree on a slip: one alone may move as the robot does."""
 
 MOST = 0.75
 """Share of the landmarks in view that stands for all of them: some points are false."""
+
+UNSEEN_NS = to_ns(1.0)
+"""For how long a slip goes on unseen."""
 
 MAX_MOTIONS = 1000
 """Motions between observations that are remembered."""
 
 
 @dataclass(frozen=True, slots=True)
+class _Look:
+    """An observation, and how many of the motions that are remembered were before it."""
+
+    event: ObservationEvent
+    motions: int
+
+
+@dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Landmarks (m,) that two observations are of, and where they were seen, body frame."""
+    """Landmarks (m,) that a sensor has seen twice, and points (m, 3) of theirs, body frame."""
 
     event: ObservationEvent  # the later one …
-    rows: IntArray  # … and which of its points these are
-    before: FloatArray  # (m, 3) metres, as points
+    rows: list[int]  # … and which of its points these are
+    ids: list[int]
+    before: FloatArray
+    points: FloatArray
+    expected: FloatArray  # where odometry has them
+    motion: FloatArray  # (4, 4) in between, by odometry, …
+    motions: list[Motion]  # … in pieces
 
     @classmethod
-    def of(cls, start: ObservationEvent, event: ObservationEvent) -> _Pairs:
-        """Return those of two observations."""
-        are_same = (start.ids[:, None] == event.ids) & (event.ids != UNKNOWN_ID)
-        before, now = np.nonzero(are_same)
-        return cls(event, now, start.points[before])
+    def of(cls, start: _Look, now: _Look, motions: list[Motion]) -> _Pairs:
+        """Return those of two looks, between which there were ``motions``."""
+        first = {i: row for row, i in enumerate(start.event.ids.tolist()) if i != UNKNOWN_ID}
+        both = [(row, i) for row, i in enumerate(now.event.ids.tolist()) if i in first]
+        rows, ids = [row for row, _ in both], [i for _, i in both]
+        before = start.event.points[[first[i] for i in ids]]
+        motion = _product(motions)
+        expected = (before - motion[:3, 3]).dot(motion[:3, :3])
+        points = now.event.points[rows]
+        return cls(now.event, rows, ids, before, points, expected, motion, motions)
 
     @property
-    def ids(self) -> IntArray:
-        return self.event.ids[self.rows]
+    def lagging(self) -> list[int]:
+        """Those that have not gone half of the way that they should have gone."""
+        way, made = self.expected - self.before, self.points - self.before
+        ahead = np.einsum('ij,ij->i', made - 0.5 * way, way).tolist()
+        return [i for i, much in zip(self.ids, ahead, strict=True) if much <= 0.0]
 
     @property
-    def points(self) -> FloatArray:
-        return self.event.points[self.rows]
+    def squared_way(self) -> float:
+        """Sum of the squares of the ways that they should have gone, m²."""
+        way = (self.expected - self.before).ravel()
+        return float(way.dot(way))
 
-    def share(self, motion: FloatArray) -> float:
-        """Return how much of their shift by a ``motion`` (4, 4) has been seen."""
-        predicted = se3.transform(se3.inverse(motion), self.before) - self.before
-        square = np.vdot(predicted, predicted)
-        return float(np.vdot(predicted, self.points - self.before) / square) if square else 0.0
+    def after(self, share: FloatArray) -> FloatArray:
+        """Return where (m, 3) they should be if a ``share`` (6,) of the motion was made."""
+        back = se3.exp(-share * se3.log(self.motion))
+        return se3.transform(back, self.before)
 
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """What landmarks (m,) in view have done in the robot's frame, in standard deviations."""
+    """What landmarks (m,) have done in the robot's frame, in standard deviations."""
 
-    ids: IntArray
+    ids: list[int]
     shift: FloatArray  # from where each was
-    error: FloatArray  # from where odometry has it, with the noise of that
-    off: FloatArray  # (m, k) the same in metres, body frame
+    way: FloatArray  # by odometry, which may be off as well
+    error: FloatArray  # from where that has it
+    slipped: FloatArray  # (s, m) from where each of the SLIPS has it
+    off: FloatArray  # (m, k) the error in metres, body frame
     noise: FloatArray  # (m, k, k) of the sensor in both observations, m²
     C: FloatArray  # (m, k, p) how the motion's error moves each
+    motion_noise: FloatArray  # (p, p)
 
     @classmethod
-    def of(
-        cls, state: State, pairs: _Pairs, motion: FloatArray, motion_noise: FloatArray
-    ) -> _View:
-        """Return what pairs of points show after a ``motion`` (4, 4) of noise (p, p)."""
-        axes, k, A = state.axes, state.axes.point, state.observer.A
-        # Of both observations: what stands has the same noise in either.
-        noise = 2.0 * state.observation_noise.covariances(pairs.event)[pairs.rows, :k, :k]
-        expected = se3.transform(se3.inverse(motion), pairs.before)
-        C = transpose(A[:k, :k]) @ axes.output_matrix(se3.transform(A, expected))
-        shifts = np.concatenate([pairs.points - pairs.before, pairs.points - expected])[:, :k]
-        with_motion = noise + C @ motion_noise @ transpose(C)
-        shift, error = mahalanobis(shifts, np.concatenate([noise, with_motion])).reshape(2, -1)
-        return cls(pairs.ids, shift, error, shifts[len(pairs.ids) :], noise, C)
-
-    def joint_error(self, mask: BoolArray, motion_noise: FloatArray) -> float:
-        """Return the errors of some landmarks as one, in squared standard deviations."""
-        C = self.C[mask].reshape(-1, self.C.shape[-1])
-        S = with_blocks(C @ motion_noise @ C.T, self.noise[mask])
-        off = self.off[mask].ravel()
-        return float(off @ np.linalg.solve(S, off))
-
-    @property
-    def gain(self) -> FloatArray:
-        """(m,) 2 ln of how much likelier it is that each stands than that it passes."""
-        return self.error**2 - self.shift**2
-
-    @property
-    def stands(self) -> BoolArray:
-        """Which (m,) are where they were."""
-        return self.shift <= NOISE
+    def of(cls, state: State, seen: list[_Pairs]) -> _View:
+        """Return what pairs of points of one sensor or several show."""
+        k, A = state.axes.point, state.observer.A
+        noise = _noise(state, seen)
+        now = np.concatenate([pairs.points for pairs in seen])
+        before = np.concatenate([pairs.before for pairs in seen])
+        expected = np.concatenate([pairs.expected for pairs in seen])
+        slipped = [np.concatenate([pairs.after(share) for pairs in seen]) for share in SLIPS]
+        shifts = (now - np.array([before, *slipped]))[:, :, :k]
+        squared = np.einsum('smi,mij,smj->sm', shifts, np.linalg.inv(noise), shifts)
+        shift, *slips = np.sqrt(np.maximum(squared, 0.0))
+        C = transpose(A[:k, :k]) @ state.axes.output_matrix(se3.transform(A, expected))
+        motion_noise = _motion_noise(state, max((pairs.motions for pairs in seen), key=len))
+        S, way = noise + C @ motion_noise @ transpose(C), (expected - before)[:, :k]
+        off = (now - expected)[:, :k]
+        error, way = mahalanobis(off, S), mahalanobis(way, S)
+        ids = [landmark_id for pairs in seen for landmark_id in pairs.ids]
+        return cls(ids, shift, way, error, np.array(slips), off, noise, C, motion_noise)
 
     @property
     def passes(self) -> BoolArray:
-        """Which (m,) are not, and nearer to where odometry has them."""
-        return (self.shift > NOISE) & (2.0 * self.error < self.shift)
+        """Which (m,) are clearly elsewhere, and nearer to where odometry has them."""
+        return (self.shift > CLEAR) & (2.0 * self.error < self.shift)
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether most have neither stood nor gone as odometry says."""
+        neither = (self.shift > MOVED) & (self.error > NOISE)
+        return bool(2 * np.count_nonzero(neither) > len(neither))
+
+    def shows(self, slipped: FloatArray, places: BoolArray) -> bool:
+        """Return whether places say so of a slip that has landmarks ``slipped`` (m,) off.
+
+        And clearly so, beside what odometry may be off by.
+        """
+        gain, agree = self.error**2 - slipped**2, places & (slipped <= NOISE)
+        differ = places & (slipped > NOISE) & (gain < -(NOISE**2))
+        if (
+            np.count_nonzero(agree & (gain > NOISE**2)) < LEAST
+            or np.count_nonzero(agree) < MOST * np.count_nonzero(places)
+            or differ.any()
+        ):
+            return False
+        C, off = self.C[agree].reshape(-1, self.C.shape[-1]), self.off[agree].ravel()
+        S = with_blocks(C @ self.motion_noise @ C.T, self.noise[agree])
+        return bool(off @ np.linalg.solve(S, off) - np.sum(slipped[agree] ** 2) > CLEAR**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """What odometry says of a motion that was not made."""
+
+    back: FloatArray  # (4, 4) motion from where odometry has the robot
+    stray: FloatArray  # (6,) twist of what may not have been made in all
 
 
 @dataclass(slots=True)
@@ -125,174 +190,224 @@ class Standing:
     """Whether the robot stands while its wheels spin, and which landmarks it carries along."""
 
     carried: set[int] = field(default_factory=set)
-    suspects: set[int] = field(default_factory=set)  # that may be carried, and those that are
-    is_spinning: bool = False
-    _witnesses: set[int] = field(default_factory=set)
+    excluded: set[int] = field(default_factory=set)  # that may be carried, and those that are
+    slip: int | None = None  # which of the SLIPS goes on
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
-    _start: ObservationEvent | None = None  # that later ones are compared with
-    _motions: list[Motion] = field(default_factory=list)  # since then
-    _used: int = 0  # of these, before the last observation
-    _before: FloatArray = field(default_factory=lambda: np.eye(4))  # motion up to the start
-    _test_ns: int = FIRST_TEST_NS  # after the start
-    _compared_ns: int = 0  # when anything was compared with it, or it was seen
-    _sorted_ns: int = 0  # when landmarks were told apart
+    _starts: dict[str, _Look] = field(default_factory=dict)  # what is compared with, by sensor
+    _latest: dict[str, _Look] = field(default_factory=dict)
+    _tested: dict[str, _Look] = field(default_factory=dict)  # the latest when that was judged
+    _due_ns: int = 0
+    _wait_ns: int = TEST_NS  # until so much has passed that it is clear
+    _odd: set[int] = field(default_factory=set)  # what did not pass as it should have
+    _usual_m2: float = 0.0  # mean square of the ways from which on it is clear what passes, …
+    _enough_m2: float = 0.0  # … or with which it is judged again
+    _confirmed_ns: int = 0  # when it was seen last that a slip goes on
+    _motions: list[Motion] = field(default_factory=list)  # since a start …
+    _earlier: list[Motion] = field(default_factory=list)  # … and those before that
 
     def clear_time(self) -> None:
         """Compare nothing with what was seen before."""
-        self.is_spinning, self._start = False, None
-        self._motions, self._before = [], np.eye(4)
+        self.slip, self._due_ns = None, 0
+        self._starts, self._latest, self._tested = {}, {}, {}
+        self._motions, self._earlier = [], []
 
     def move(self, motion: Motion) -> None:
         """Remember a motion by odometry."""
-        if self._start is not None:
-            self._motions.append(motion)
-            if len(self._motions) > MAX_MOTIONS:
-                self.clear_time()
+        self._motions.append(motion)
+        if len(self._motions) > MAX_MOTIONS:
+            self.clear_time()
 
-    def note(self, state: State, event: ObservationEvent) -> FloatArray | None:
+    def is_due(self, event: ObservationEvent) -> bool:
+        """Return whether an observation is to be judged: some times a second, or during slips."""
+        starts = self._starts
+        return (
+            event.stamp_ns >= self._due_ns
+            or self.slip is not None
+            or len(starts) > 1
+            or event.sensor_frame not in starts
+        )
+
+    def note(self, state: State, event: ObservationEvent) -> Lost | None:
         """Judge an observation that is yet to be used, by the most likely state.
 
-        Return motions (2, 4, 4) if the wheels spin: the one since the last observation, which has
-        not been made, and the one in all that may not have been.
+        Return what was not made of the motion since the last observation if the wheels slip.
         """
-        start, lost = self._start, None
-        if start is None or event.stamp_ns - self._compared_ns > 2 * LAST_TEST_NS:
-            self.clear_time()
+        if state.landmark_velocity_stddev or event.velocities is not None:
+            return None  # landmarks may move as the robot does
+        look = _Look(event, len(self._motions))
+        if self.slip is not None:
+            return self._go_on(state, look)
+        if event.sensor_frame in self._starts:
+            self._latest[event.sensor_frame] = look
+            return self._test(state, look) if event.stamp_ns >= self._due_ns else None
+        if self._starts:
+            self._starts[event.sensor_frame] = look
+        else:
             self._begin(event)
-        elif event.sensor_frame != start.sensor_frame:
-            lost = self._all_lost() if self.is_spinning else None
-        elif self.is_spinning:
-            lost = self._go_on(state, _Pairs.of(start, event))
-        elif event.stamp_ns - start.stamp_ns >= self._test_ns:
-            lost = self._test(state, _Pairs.of(start, event))
-        self._used = len(self._motions)
-        return lost
+        return None
 
     def _begin(self, event: ObservationEvent) -> None:
         """Compare with this observation from now on."""
-        self._start, self._motions, self._test_ns = event, [], FIRST_TEST_NS
-        self._compared_ns = event.stamp_ns
+        self._starts, self._latest = {event.sensor_frame: _Look(event, 0)}, {}
+        self._earlier, self._motions = self._motions, []
+        self._tested, self._enough_m2 = {}, self._usual_m2
+        self._due_ns = event.stamp_ns + self._wait_ns
 
-    def _test(self, state: State, pairs: _Pairs) -> FloatArray | None:
-        """Look for a standstill, and for landmarks that are carried along."""
-        self._compared_ns, self._test_ns = pairs.event.stamp_ns, 2 * self._test_ns
-        if len(pairs.rows) < LEAST_WITNESSES:
-            self._before = np.eye(4)
-            self._begin(pairs.event)
+    def _test(self, state: State, look: _Look) -> Lost | None:
+        """Look for a slip, and for landmarks that are carried along."""
+        event, seen = look.event, self._pairs()
+        ids = [i for pairs in seen for i in pairs.ids]
+        if len(ids) < LEAST:
+            self._begin(event)
             return None
-        motion = _product(self._motions)
-        if not self._is_usual(pairs, motion):
-            noise = self._motion_noise(state)
-            view = _View.of(state, pairs, motion, noise)
-            if self._all_stand(state, view, noise):
-                self.is_spinning = True
-                return np.array([self._all_lost()[0], self._before @ motion])
-            if self._test_ns <= LAST_TEST_NS and not self._has_passed(view):
-                return None
+        tested, self._tested = self._tested, dict(self._latest)
+        way_m2 = sum(pairs.squared_way for pairs in seen) / len(ids)
+        age_ns = event.stamp_ns - self._starts[event.sensor_frame].event.stamp_ns
+        needed = math.sqrt(self._usual_m2 / way_m2) if way_m2 else math.inf
+        self._wait_ns = int(min(max(needed * age_ns, TEST_NS), LONGEST_WAIT_NS))
+        self._due_ns = event.stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
+        if way_m2 <= self._enough_m2:
+            if age_ns > LAST_TEST_NS:
+                self._begin(event)
+            return None
+        if self._is_usual(ids, {i for pairs in seen for i in pairs.lagging}):
+            self._usual_m2 *= FORGOTTEN
+            self._begin(event)
+            return None
+        view = _View.of(state, seen)
+        self._usual_m2 = way_m2 * USUAL**2 / np.mean(view.way**2)
+        self._enough_m2 = 2.0 * way_m2
+        if self._slips(state, view):
+            self._confirmed_ns, self._starts = event.stamp_ns, self._latest
+            lost = self._lost(self._motions[-1:], self._earlier + self._motions)
+            self._motions = []
+            return lost
+        if view.passes.any():
             self._sort(view)
-            self._sorted_ns = pairs.event.stamp_ns
-        self._before = motion
-        self._begin(pairs.event)
+            self._begin(event)
+        elif view.is_mixed and tested:
+            # A slip has begun meanwhile, or ended.
+            self._starts, self._tested, self._enough_m2 = tested, {}, 0.0
+            return self._test(state, look)
         return None
 
-    def _is_usual(self, pairs: _Pairs, motion: FloatArray) -> bool:
-        """Return whether places have passed, as nearly always.
+    def _is_usual(self, ids: list[int], lagging: set[int]) -> bool:
+        """Return whether all passes but for what is carried, and now and then for one more."""
+        odd = lagging ^ self.carried.intersection(ids)
+        before, self._odd = self._odd, odd
+        return 2 * len(odd) < len(ids) and odd.isdisjoint(before)
 
-        What has passed before is judged one by one from time to time: it may have been picked up.
-        """
-        return (
-            pairs.event.stamp_ns - self._sorted_ns < LAST_TEST_NS
-            and self._witnesses.issuperset(pairs.ids.tolist())
-            and pairs.share(motion) > 0.5
-        )
+    def _pairs(self) -> list[_Pairs]:
+        """Return what each sensor has seen at the start and lately, where it has."""
+        looks = [(self._starts[name], now) for name, now in self._latest.items()]
+        seen = [_Pairs.of(a, b, self._motions[a.motions : b.motions]) for a, b in looks]
+        return [pairs for pairs in seen if pairs.ids]
 
-    def _go_on(self, state: State, pairs: _Pairs) -> FloatArray | None:
-        """Return what :meth:`note` does while the wheels spin, or None once they don't."""
-        if len(pairs.rows) >= LEAST_WITNESSES:
-            view = _View.of(state, pairs, np.eye(4), np.zeros((state.axes.p, state.axes.p)))
-            stands = view.stands[self._may_witness(state, view.ids)]
-            if len(stands) >= LEAST_WITNESSES and 2 * np.count_nonzero(stands) >= len(stands):
-                lost = self._all_lost()
-                self._compared_ns, self._motions = pairs.event.stamp_ns, []
-                return lost
-        self.clear_time()
-        self._begin(pairs.event)
-        return None
+    def _slips(self, state: State, view: _View) -> bool:
+        """Find out whether one of the SLIPS has begun."""
+        places = self._are_places(state, view.ids)
+        for slip, slipped in enumerate(view.slipped):
+            if view.shows(slipped, places):
+                self.slip = slip
+                return True
+        return False
 
-    def _all_lost(self) -> FloatArray:
-        """Return the motion since the last observation, twice (2, 4, 4)."""
-        return np.tile(_product(self._motions[self._used :]), (2, 1, 1))
+    def _go_on(self, state: State, look: _Look) -> Lost | None:
+        """Return what :meth:`note` does during a slip, or None once it is over."""
+        event, made = look.event, self._motions
+        self._slip_on(made)
+        start = self._starts.setdefault(event.sensor_frame, _Look(event, 0))
+        pairs, agree = _Pairs.of(start, look, []), np.empty(0, dtype=np.bool_)
+        if pairs.ids:
+            shift = (pairs.points - pairs.before)[:, : state.axes.point]
+            agree = mahalanobis(shift, _noise(state, [pairs])) <= NOISE
+            agree = agree[self._are_places(state, pairs.ids)]
+        if start.event is not event and np.count_nonzero(agree) >= LEAST:
+            self._confirmed_ns = event.stamp_ns
+            if self.slip and event.stamp_ns - start.event.stamp_ns > UNSEEN_NS:
+                self._starts = {event.sensor_frame: _Look(event, 0)}  # whose turn is exact
+        is_unseen = event.stamp_ns - self._confirmed_ns > UNSEEN_NS
+        if 2 * np.count_nonzero(agree) < len(agree) or is_unseen:
+            self.slip = None
+            self._begin(event)
+            return None
+        return self._lost(made, made)
 
-    def _has_passed(self, view: _View) -> bool:
-        """Return whether most of what was in view is elsewhere now, but for what is carried."""
-        stands = view.stands[[i not in self.suspects for i in view.ids.tolist()]]
-        return bool(2 * np.count_nonzero(stands) <= len(stands))
+    def _slip_on(self, made: list[Motion]) -> None:
+        """Move what is compared with by what a slip makes of motions; forget these."""
+        back = se3.exp(-SLIPS[self.slip or 0] * se3.log(_product(made)))
+        for name, start in self._starts.items():
+            points = se3.transform(back, start.event.points)
+            self._starts[name] = _Look(replace(start.event, points=points), 0)
+        self._motions = []
 
-    def _all_stand(self, state: State, view: _View, motion_noise: FloatArray) -> bool:
-        """Return whether all that is in view says that the robot stands, and clearly so."""
-        witnesses = self._may_witness(state, view.ids)
-        stands = view.stands & witnesses
-        if (
-            np.count_nonzero(stands & (view.gain > NOISE**2)) < LEAST_WITNESSES
-            or np.count_nonzero(stands) < MOST * np.count_nonzero(witnesses)
-            or (view.passes & witnesses).any()
-        ):
-            return False
-        likelier = view.joint_error(stands, motion_noise) - np.sum(view.shift[stands] ** 2)
-        return bool(likelier > CLEAR**2)
+    def _lost(self, made: list[Motion], whole: list[Motion]) -> Lost:
+        """Return what was lost of motions, and may be of others."""
+        share, motion = SLIPS[self.slip or 0], _product(made)
+        back = se3.inverse(motion).dot(se3.exp(share * se3.log(motion)))
+        return Lost(back, (1.0 - share) * se3.log(_product(whole)))
 
-    def _may_witness(self, state: State, ids: IntArray) -> BoolArray:
-        """Return which landmarks (m,) are places, as far as is known."""
-        if state.is_mapping:
-            return np.array([i in self._witnesses for i in ids.tolist()], dtype=np.bool_)
-        return np.ones(len(ids), dtype=np.bool_)
-
-    def _motion_noise(self, state: State) -> FloatArray:
-        """Return the covariance (p, p) of the motion since the start, with that of its bias."""
-        noise = np.zeros((state.axes.p, state.axes.p))
-        if not self._motions:
-            return noise
-        # A sensor whose calibration has begun since has no part in it.
-        c = self._motions[0].sensitivity.shape[1]
-        F = np.sum([motion.sensitivity[:, :c] for motion in self._motions], axis=0)
-        noise += np.sum([motion.noise for motion in self._motions], axis=0)
-        noise += (F * state.filter.calibration_variances[:c]) @ F.T
-        return noise
+    def _are_places(self, state: State, ids: list[int]) -> BoolArray:
+        """Return which landmarks (m,) are at rest, as far as is known."""
+        places = np.array([i not in self.excluded for i in ids], dtype=np.bool_)
+        if not state.is_mapping:
+            places &= state.landmarks.rows_of(np.array(ids)) >= 0
+        return places
 
     def _sort(self, view: _View) -> None:
-        """Tell landmarks that pass, and are places, from those that stand still meanwhile."""
-        passed = view.ids[view.passes].tolist()
-        self._witnesses.update(passed)
-        for landmark_id in self._evidence.keys() & passed:
-            del self._evidence[landmark_id]
-        if len(passed) >= LEAST_WITNESSES:
-            stands = view.stands & (view.gain > NOISE**2)
-            gains = dict(zip(view.ids[stands].tolist(), view.gain[stands].tolist(), strict=True))
-            self._evidence |= {i: self._evidence.get(i, 0.0) + gain for i, gain in gains.items()}
-        self.suspects = {i for i, evidence in self._evidence.items() if evidence > CLEAR**2}
-        self.carried |= {i for i in self.suspects if self._evidence[i] > 2.0 * CLEAR**2}
+        """Find out which landmarks stand still while others pass."""
+        gain = np.clip(view.error**2 - view.shift**2, -(CLEAR**2), CLEAR**2)
+        gain[(gain > 0.0) & (view.shift > NOISE)] = 0.0
+        for landmark_id, more in zip(view.ids, gain.tolist(), strict=True):
+            much = self._evidence.get(landmark_id, 0.0) + more
+            self._evidence[landmark_id] = min(max(much, 0.0), CERTAIN)
+        evidence = self._evidence = {i: much for i, much in self._evidence.items() if much}
+        self.carried = {i for i, much in evidence.items() if much == CERTAIN or i in self.carried}
+        self.excluded = self.carried | {i for i, much in evidence.items() if much >= CLEAR**2}
 
 
-def take_back(state: State, lost: FloatArray) -> None:
-    """Take the first of two motions (2, 4, 4) back, which was not made, nor perhaps the second."""
-    A, (turn, way) = state.observer.A, se3.log(lost[1]).reshape(2, 3)
-    noise = block_diag(np.outer(turn, turn), np.outer(way, way))
+def _noise(state: State, seen: list[_Pairs]) -> FloatArray:
+    """Return the covariances (m, k, k) of both points of landmarks that stand, m²."""
+    each = [state.observation_noise.covariances(pairs.event)[pairs.rows] for pairs in seen]
+    both: FloatArray = 2.0 * np.concatenate(each)[:, : state.axes.point, : state.axes.point]
+    return both
+
+
+def _product(motions: list[Motion]) -> FloatArray:
+    """Return motions, one after the other, as one (4, 4), in the robot's frame at their start."""
+    if not motions:
+        return np.eye(4)
+    ends = np.array([(motion.path[0], motion.path[-1]) for motion in motions])
+    whole, *others = np.linalg.solve(ends[:, 0], ends[:, 1])
+    for step in others:
+        whole = whole.dot(step)
+    product: FloatArray = whole
+    return product
+
+
+def _motion_noise(state: State, motions: list[Motion]) -> FloatArray:
+    """Return the covariance (p, p) of motions by odometry, with that of its bias."""
+    # A sensor whose calibration has begun since has no part in it.
+    c = motions[0].sensitivity.shape[1]
+    F = np.sum([motion.sensitivity[:, :c] for motion in motions], axis=0)
+    noise = np.sum([motion.noise for motion in motions], axis=0)
+    # As it is stated: what slips and carried landmarks have added to it is no reason to wait.
+    noise = noise / max(1.0, state.motion_noise.factors.applied.max())
+    total: FloatArray = noise + (F * state.filter.calibration_variances[:c]) @ F.T
+    return total
+
+
+def take_back(state: State, lost: Lost) -> None:
+    """Take back what was not made of the last motion."""
+    A, (turn, way) = state.observer.A, lost.stray.reshape(2, 3)
     motion = Motion(
-        path=np.array([A, A @ se3.inverse(lost[0])]),
+        path=np.array([A, A @ lost.back]),
         measured_velocities=np.zeros((1, 6)),
         dt_s=np.zeros(1),
-        covariances=noise[None],
+        covariances=block_diag(np.outer(turn, turn), np.outer(way, way))[None],
         duration_s=0.0,
         at_ends=None,
         calibration=state.filter.calibration,
         is_slip=True,
     )
     state.propagate(motion)
-
-
-def _product(motions: list[Motion]) -> FloatArray:
-    """Return motions, one after the other, as one (4, 4), in the robot's frame at their start."""
-    whole = np.eye(4)
-    for motion in motions:
-        whole = whole @ se3.inverse(motion.path[0]) @ motion.path[-1]
-    return whole
