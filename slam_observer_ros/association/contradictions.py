@@ -9,7 +9,6 @@ is decided here.
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,7 +63,7 @@ class Contradictions:
 
     def _agree(self, state: State, matched: MatchedObservation, others: list[int]) -> bool:
         """Return whether a pose that explains what is seen explains the ``others``, too."""
-        trial = deepcopy(state)
+        trial = state.copy()
         slip(trial, matched)
         trial.filter.correct(match(trial, matched.event).residuals)
         ids = np.array(others)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 import math
 
@@ -193,9 +192,9 @@ class Hypotheses:
         return bool(rows[0][0] >= 0)
 
     @property
-    def carried_ids(self) -> frozenset[int]:
+    def carried_ids(self) -> set[int]:
         """Landmarks that move with the robot, and are not used."""
-        return frozenset(self._standing.carried)
+        return self._standing.carried
 
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
@@ -270,7 +269,7 @@ class Hypotheses:
             else:
                 uses[number] -= 1
                 if uses[number]:
-                    hypothesis = deepcopy(hypothesis)
+                    hypothesis = hypothesis.copy()
             # Of hypotheses that become one, the first stands for all.
             child = self._child(hypothesis, taken, event)
             if not any(_are_one(child, other) for other in children):

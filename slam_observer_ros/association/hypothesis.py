@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
+from copy import copy
 from dataclasses import dataclass, field
 
 from slam_observer_ros.association.landmark_index import LandmarkIndex
@@ -26,4 +26,8 @@ class Hypothesis:
 
     def with_state(self, state: State) -> Hypothesis:
         """Return another hypothesis, which has had the same landmarks in view."""
-        return Hypothesis(state, deepcopy(self.visibility), deepcopy(self.index), self.cost)
+        return Hypothesis(state, self.visibility.copy(), copy(self.index), self.cost)
+
+    def copy(self) -> Hypothesis:
+        """Return an independent copy."""
+        return self.with_state(self.state.copy())

@@ -12,7 +12,6 @@ someone carried it, and would be lost if it went on without what it sees.
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -174,7 +173,7 @@ def _after_slip(
     settings = state.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return None
-    slipped = deepcopy(state)
+    slipped = state.copy()
     cost = slip(slipped, matched)
     residuals = match(slipped, event).residuals
     if _are_rejected(slipped, residuals).any():

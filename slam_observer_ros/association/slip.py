@@ -36,7 +36,7 @@ def slip(state: State, matched: MatchedObservation) -> float:
     the observation is yet to be used.
     """
     # The noise of a motion without odometry, for as long as it takes.
-    observer, start = state.observer, state.observer.A
+    observer, start = state.observer, state.observer.A.copy()
     needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
     stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
     noise = state.motion_noise.covariances(stray)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 import math
 
 import numpy as np
@@ -15,11 +16,6 @@ from slam_observer_ros.state.state import State
 
 IMPROBABLE = 20.0
 """−ln of the probability below which it is no chance that none of several landmarks is seen."""
-
-MIN_SHARE, MOST_SHARE = 0.1, 0.9
-"""How often a landmark in view is seen at least, as in a map that was loaded, and at most: one
-that was seen each time may yet be hidden.
-"""
 
 MOVED_M = 0.05
 """Distance, metres, after which a robot looks from another place; and turn, rad."""
@@ -41,6 +37,12 @@ class Visibility:
         self._newest_number = 0
         self.missed = 0.0  # confirmed landmarks that should have been seen last, and were not
         self._in_view, self._seen = 1, 1  # confirmed landmarks so far
+
+    def copy(self) -> Visibility:
+        """Return an independent copy: no array is ever changed in place."""
+        other = copy(self)
+        other._field_of_view = copy(self._field_of_view)
+        return other
 
     def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
         """Count which landmarks were in view of an observation, already used, and which were seen.
@@ -64,6 +66,8 @@ class Visibility:
         cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
         self.missed = self._missed(in_view & ~landmarks.tentative, seen)
         landmarks.note_in_view(rows, seen[rows], self._has_moved(state))
+        if not some_have_ids:  # those that a loaded map has by an id
+            landmarks.note_missed(np.flatnonzero(~is_numbered & in_view), seen)
         self._field_of_view.include(event.points)
         # Those that were seen too seldom, and those that were confirmed.
         were_tentative = np.count_nonzero(landmarks.tentative)
@@ -98,7 +102,7 @@ class Visibility:
         """
         if not self._field_of_view.is_known:
             return 0.0
-        p, missed = _seen_share(landmarks), landmarks.missed[unseen]
+        p, missed = landmarks.likely_share, landmarks.missed[unseen]
         return 2.0 * float(np.sum(np.log1p(p / (1.0 + missed * p))))
 
     def _add_evidence(
@@ -114,15 +118,10 @@ class Visibility:
         if (old & seen).any():
             self._evidence = 0.0
         elif len(event.points) and self._field_of_view.is_known:
-            evidence = -math.log1p(-_seen_share(landmarks)) * int(np.sum(old))
+            evidence = -math.log1p(-landmarks.likely_share) * int(np.sum(old))
             self._evidence += min(evidence, MAX_EVIDENCE)
         is_unexpected = self._evidence > IMPROBABLE
         if is_unexpected or self._evidence == 0.0:
             self._evidence = 0.0
             self._newest_number = int(np.max(numbers, initial=0))
         return is_unexpected
-
-
-def _seen_share(landmarks: LandmarkTable) -> float:
-    """Return how often a landmark in view is seen, as far as it is known."""
-    return min(max(landmarks.seen_share, MIN_SHARE), MOST_SHARE)

@@ -18,7 +18,7 @@ def table_of(title: str, rows: Mapping[str, str]) -> Table:
 
 
 def columns_of(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with a line for each of ``rows``, the first of which is its name."""
+    """Return a table with a line for each of ``rows``, whose first entry is its name."""
     table = Table(title=title, title_justify='left')
     for number, heading in enumerate(headings):
         table.add_column(heading, overflow='fold', justify='right' if number else 'left')

@@ -1,4 +1,4 @@
-"""Arrays, and what never changes."""
+"""Arrays."""
 
 from __future__ import annotations
 
@@ -15,11 +15,3 @@ IntArray: TypeAlias = NDArray[np.int64]
 
 BoolArray: TypeAlias = NDArray[np.bool_]
 """Array of bool: masks over landmarks."""
-
-
-class Immutable:
-    """What never changes once it is made: copies of its owners share it."""
-
-    def __deepcopy__(self, _memo: object) -> Immutable:
-        """Return the thing itself."""
-        return self

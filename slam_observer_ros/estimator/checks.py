@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 import math
@@ -153,6 +154,18 @@ def usable_map(landmark_map: LandmarkMap) -> LandmarkMap:
     if sigmas is not None and np.any(sigmas < 0.0):
         raise MapError('map orientation sigmas: one is negative')
     return landmark_map if R is None else replace(landmark_map, orientations=so3.exact(R))
+
+
+def usable_maps(landmark_map: LandmarkMap | Sequence[LandmarkMap]) -> list[LandmarkMap]:
+    """Return one map or several, each as :func:`usable_map` does; several are in one frame."""
+    maps = list(landmark_map) if isinstance(landmark_map, Sequence) else [landmark_map]
+    maps = [usable_map(known) for known in maps]
+    if not maps or (len(maps) > 1 and not all(len(known.ids) for known in maps)):
+        raise MapError('a map of several is empty, or there is none')
+    first, *others = sorted({known.frame_id for known in maps})
+    if others:
+        raise MapError(f"the maps are in frames '{first}' and '{others[0]}': make them the same")
+    return maps
 
 
 def _check_joint(landmark_map: LandmarkMap) -> None:

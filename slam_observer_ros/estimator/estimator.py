@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import logging
 import math
 import time
@@ -19,7 +19,7 @@ from slam_observer_ros.estimator.checks import (
     check_event,
     check_velocities,
     rigid,
-    usable_map,
+    usable_maps,
     usable_points,
 )
 from slam_observer_ros.estimator.event_queue import EventQueue
@@ -133,7 +133,7 @@ class Estimator:
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
                 way,
             )
-            self.reset(None if self._localiser.loaded else self._start_pose)
+            self.reset(None if self._localiser.maps else self._start_pose)
         else:
             logger.warning('The clock has jumped%s; pose and map are held.', way)
             self._timeline.catch_up()
@@ -147,11 +147,14 @@ class Estimator:
 
     def load_map(
         self,
-        landmark_map: LandmarkMap,
+        landmark_map: LandmarkMap | Sequence[LandmarkMap],
         pose: FloatArray | None = None,
         pose_covariance: FloatArray | None = None,
     ) -> None:
         """Estimate in the frame of a map from now on, as ``localization_mode`` says.
+
+        Of several maps it is the one in which the robot is found; a given pose is then where it is
+        looked for in each of them.
 
         With a ``pose`` (4, 4) in that frame and its ``pose_covariance`` (6, 6; default exact),
         what was mapped is forgotten. By default the pose is that of the settings, if the robot is
@@ -160,13 +163,14 @@ class Estimator:
         frame. Raise MapError or ParameterError if one of them can't be right; nothing is changed
         then.
         """
-        landmark_map = usable_map(landmark_map)
+        maps = usable_maps(landmark_map)
         if self.settings.localization_mode == 'off':
-            self._warnings.loaded_map(len(landmark_map.ids), self.settings.max_landmarks)
+            largest = max(len(known.ids) for known in maps)
+            self._warnings.loaded_map(largest, self.settings.max_landmarks)
         if pose is not None:
             pose = rigid(pose, pose_covariance)
             self._timeline.catch_up()
-        self._localiser.load(landmark_map, self.settings.two_d_mode)
+        self._localiser.load(maps, self.settings.two_d_mode)
         # The pose in it: the given one, the one of the settings, or the one that landmarks show.
         is_at_start = self.stamp_ns is None and not self._was_placed
         if pose is not None:
@@ -292,9 +296,8 @@ class Estimator:
         had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
         landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'carried_landmark'``,
         ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``,
-        ``'merged_landmark'``) and points not
-        used (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
-        ``'unweighed_point'``).
+        ``'merged_landmark'``, ``'doubled_landmark'``) and points not used (``'unknown_id'``,
+        ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
@@ -317,6 +320,12 @@ class Estimator:
         places = [] if self.is_localised else self._localiser.places
         poses = [place.transform @ self._state.observer.A for place in places]
         return np.array(poses).reshape(-1, 4, 4)
+
+    @property
+    def map_name(self) -> str:
+        """Name of the loaded map in whose frame the estimate is; empty if it is in none."""
+        loaded = self._localiser.loaded
+        return loaded.name if loaded is not None and self.is_localised else ''
 
     @property
     def landmark_map(self) -> LandmarkMap:
@@ -562,6 +571,7 @@ class Estimator:
             logger.info('A loop has closed: %d landmarks without ids were seen before.', merged)
         if len(self._hypotheses) == 1:
             closure.merge_twins(state)
+            closure.count_doubled(state)
 
     def _doubt_rough_pose(self, event: ObservationEvent) -> None:
         """Search about a given pose that is too rough for the points of an observation."""
@@ -574,7 +584,7 @@ class Estimator:
 
     def _localise(self, event: ObservationEvent, outcome: Outcome) -> None:
         """Look for the pose in a loaded map if it is not known, or not any more."""
-        if self._localiser.loaded is None:
+        if not self._localiser.maps:
             return
         missed = self._hypotheses.missed
         reason = self._localiser.reason_to_reset(self._state, event, outcome, missed)
@@ -584,7 +594,7 @@ class Estimator:
         if self._localiser.search(self._state):
             self._hypotheses.prune_to_best()
         elif (found := self._localiser.pose_by_tag(self._state)) is not None:
-            self._start(found.pose, found.covariance)
+            self._start(found.pose, found.covariance, found.known)
             self._localiser.try_tag(found.tag_id)
 
     def _start_again(self, distance_m: float) -> None:
@@ -613,11 +623,24 @@ class Estimator:
         pose = se3.from_rpy((*settings.initial_position, *turn))
         self._start(pose, np.diag(np.repeat(deviations, 3) ** 2))
 
-    def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
-        """Start again with an empty map, or the loaded one, at ``pose`` (4, 4) if it is known."""
+    def _start(
+        self,
+        pose: FloatArray | None,
+        covariance: FloatArray | None = None,
+        known: LandmarkMap | None = None,
+    ) -> None:
+        """Start again with an empty map, or the loaded one, at ``pose`` (4, 4) if it is known.
+
+        ``known`` is the map that it is in; of several ones it is searched for if that is None.
+        """
+        rough = pose if known is None and len(self._localiser.maps) > 1 else None
+        pose = pose if rough is None else None
         state = self._state_at(np.eye(4) if pose is None else self._allowed(pose))
         self._hypotheses.reset(state)
-        self._localiser.start(state, pose is not None, covariance)
+        self._localiser.start(state, pose is not None, covariance, known)
+        if rough is not None:
+            given = np.zeros((6, 6)) if covariance is None else covariance
+            self._localiser.search_near(rough, given + np.diag(GIVEN_POSE_STD**2))
 
     def _state_at(self, pose: FloatArray) -> State:
         """Return a state at its start, with P° = ``pose`` (4, 4)."""

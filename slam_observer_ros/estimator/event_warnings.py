@@ -33,6 +33,9 @@ UNEXPECTED_POSES = {
     'stated noise of its velocity is too small',
     'unexpected_place': 'Nothing that is seen is where the map has it: if the robot slipped or '
     'was carried, without ids it is found again in a loaded map only',
+    'doubled_landmark': 'A landmark without an id was added where a known one should be seen and '
+    'is not: that one was moved, or it is in the map twice now, as the stated noise of the '
+    'velocity or of the points is too small',
 }
 """What is wrong with the robot's pose when these counts grow."""
 
@@ -157,7 +160,7 @@ class EventWarnings:
             )
             self._warn('many_moved', text)
 
-    def carried_landmarks(self, ids: frozenset[int]) -> None:
+    def carried_landmarks(self, ids: set[int]) -> None:
         """Warn of landmarks that move with the robot, whenever there are more of them."""
         if len(ids) > self._reported['carried_landmark']:
             logger.warning('Not used: landmarks %s move with the robot.', _list(sorted(ids)))

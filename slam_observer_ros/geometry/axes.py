@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, Immutable, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 
 
-class EstimatedAxes(Immutable):
+class EstimatedAxes:
     """Coordinates of the pose error and of each landmark error that are estimated.
 
     Attributes

@@ -1,4 +1,4 @@
-"""Small matrices, of which a filter handles several at each observation."""
+"""Small matrices: a filter handles several at each observation."""
 
 from __future__ import annotations
 

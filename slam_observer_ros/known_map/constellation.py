@@ -44,28 +44,38 @@ def find_places(
     seen: Constellation,
     prior: PlacePrior,
     error_probability: float,
+    log_rival: float = -math.inf,
+    looks: int = MAX_LOOKS,
 ) -> Places:
     """Return the places in a map where a constellation may be, the most likely first.
 
-    Places whose share is far below ``error_probability`` may be missing. The search ends early
-    where two places fit so well that none of them can be trusted, and where it would take too
-    long; then the result is not complete.
+    Places whose share is far below ``error_probability`` may be missing, also beside a place in
+    another map, of mass exp(``log_rival``). The search ends early where two places fit so well
+    that none of them can be trusted, and where it would take too long, after so many ``looks``;
+    then the result is not complete.
     """
     weighing = Weighing(known, seen, prior)
-    search = _Search(known, seen, weighing, math.log(error_probability))
+    search = _Search(known, seen, weighing, log_rival, math.log(error_probability), looks)
     is_complete = len(seen) > known.axes.point and search.run()
-    return weighing.places(search.found, is_complete)
+    return Places.weighed(search.found, weighing.log_none, is_complete)
 
 
 class _Search:
     """The search for places of m points, from those with the most matches to those with fewer."""
 
     def __init__(
-        self, known: MappedLandmarks, seen: Constellation, weighing: Weighing, margin: float
+        self,
+        known: MappedLandmarks,
+        seen: Constellation,
+        weighing: Weighing,
+        log_rival: float,
+        margin: float,
+        looks: int,
     ) -> None:
-        self.known, self.seen, self.weighing, self.margin = known, seen, weighing, margin
+        self.known, self.seen, self.weighing = known, seen, weighing
+        self.log_rival, self.margin = log_rival, margin
         self.found: list[Place] = []
-        self.looks_left, self.places_left = MAX_LOOKS, MAX_PLACES
+        self.looks_left, self.places_left = looks, MAX_PLACES
         self.sides = _Sides(known, seen)
         self._is_within_reach = known.reach(self.sides.longest_m) >= self.sides.longest_m
 
@@ -85,13 +95,15 @@ class _Search:
 
     def _could_matter(self, matches: int) -> bool:
         """Return whether a place with so many matches could be as likely as the best one."""
-        best = max([place.log_mass for place in self.found], default=self.weighing.log_none)
-        return self.weighing.at_best(matches) > max(best, self.weighing.log_none) + self.margin
+        masses = [place.log_mass for place in self.found]
+        best = max(self.log_rival, self.weighing.log_none, *masses)
+        return self.weighing.at_best(matches) > best + self.margin
 
     def _is_undecided(self) -> bool:
         """Return whether a second place is so likely that none can be trusted."""
-        masses = sorted((place.log_mass for place in self.found), reverse=True)
-        return len(masses) > 1 and masses[1] > masses[0] + self.margin
+        masses = [self.log_rival, *(place.log_mass for place in self.found)]
+        second, first = sorted([-math.inf, *masses])[-2:]
+        return second > first + self.margin
 
     def _find(self, matches: int) -> bool:
         """Find all places with so many matches; return whether that could be done."""

@@ -29,6 +29,7 @@ class LandmarkMap:
     # (3 (n + t), …) of all positions together, m², whose blocks on the diagonal are the
     # covariances, and then of the rotation vectors, map axes, of the t that have an orientation
     joint_covariance: FloatArray | None = None
+    name: str = ''  # its file's, by which several maps are named
 
     def select(self, rows: IntArray | BoolArray) -> LandmarkMap:
         """Return the map of the landmarks at ``rows``."""
@@ -47,6 +48,7 @@ class LandmarkMap:
             part(self.orientations),
             part(self.orientation_sigmas),
             None if joint is None else part_of_joint(joint, len(self.ids), self.tags, rows),
+            self.name,
         )
 
     @property

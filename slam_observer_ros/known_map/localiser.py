@@ -1,15 +1,16 @@
-"""Decides when the estimate enters a loaded map, and when it is lost there."""
+"""Decides when the estimate enters a loaded map, or one of several, and when it is lost there."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 import logging
 import math
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.known_map.finder import Finder
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
@@ -44,7 +45,8 @@ class Localiser:
     """Follows whether the estimate is in the frame of a map that was loaded."""
 
     def __init__(self) -> None:
-        self.loaded: LandmarkMap | None = None
+        self.maps: list[LandmarkMap] = []  # in one of which the robot is
+        self.loaded: LandmarkMap | None = None  # that one, once it is known
         self.is_localised = True  # in the final frame: always, unless a map was loaded
         self.counts: Counter[str] = Counter()  # 'not_localised' observations, poses 'lost'
         self._trial: PoseTrial | None = None
@@ -56,10 +58,10 @@ class Localiser:
         self._tag: int | None = None  # which the pose was taken from that is on trial
         self._refused: set[int] = set()  # tags whose poses were wrong
 
-    def load(self, landmark_map: LandmarkMap, two_d_mode: bool) -> None:
-        """Take a map instead of one loaded before; the pose in it is yet to be found."""
-        self.loaded = landmark_map.flattened() if two_d_mode else landmark_map
-        if landmark_map.is_planar and not two_d_mode:
+    def load(self, maps: Sequence[LandmarkMap], two_d_mode: bool) -> None:
+        """Take maps instead of those loaded before; the pose in one of them is yet to be found."""
+        self.maps = [known.flattened() if two_d_mode else known for known in maps]
+        if any(known.is_planar for known in maps) and not two_d_mode:
             logger.warning(
                 'The map was made with two_d_mode, which is off: in space its heights of zero are '
                 'taken for exact (use two_d_mode: true for a robot on a floor).'
@@ -67,13 +69,22 @@ class Localiser:
         self._refused = set()
         self._search_again()
 
-    def start(self, state: State, pose_is_given: bool, covariance: FloatArray | None) -> None:
-        """Take a state at its start, in the loaded map if its pose there is given.
+    def start(
+        self,
+        state: State,
+        pose_is_given: bool,
+        covariance: FloatArray | None,
+        known: LandmarkMap | None,
+    ) -> None:
+        """Take a state at its start, in a loaded map if its pose there is given.
 
-        ``covariance`` (6, 6) is that of the given pose; None for an exact one.
+        ``covariance`` (6, 6) is that of the given pose; None for an exact one. ``known`` is the
+        map that it is in, if there are several.
         """
         self._search_again()
-        self.is_localised = self.loaded is None or pose_is_given
+        self.is_localised = not self.maps or pose_is_given
+        if known is not None:
+            self.loaded = known
         if self.loaded is not None and pose_is_given:
             start_in_map(state, self.loaded, covariance)
             self._trial = PoseTrial(self.loaded)
@@ -85,6 +96,7 @@ class Localiser:
     def _search_again(self) -> None:
         """Take the pose in the map for unknown, and forget what was seen."""
         self.is_localised = False
+        self.loaded = self.maps[0] if len(self.maps) == 1 else None
         self._trial = self._finder = self._rough = self._tag = None
         self._said_problem = False
         self._comparisons, self._unexplained = Comparisons(), Unexplained()
@@ -97,7 +109,7 @@ class Localiser:
     def search_near(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Search about a pose (4, 4) of the state at its start, with a covariance (6, 6)."""
         self._rough = pose, covariance
-        logger.info('The pose that was given is rough: searching the map about it.')
+        logger.info('Searching %s about the pose that was given.', self._where)
 
     def reason_to_reset(
         self, state: State, event: ObservationEvent, outcome: Outcome, missed: float
@@ -123,9 +135,10 @@ class Localiser:
 
     def search(self, state: State) -> bool:
         """Enter the map after an observation, if it is time to compare; return whether it did."""
-        if self.loaded is None or self.is_localised:
+        if self.is_localised:
             return False
-        shared = int(np.sum(state.landmarks.rows_of(self.loaded.ids) >= 0))
+        ids = np.concatenate([known.ids for known in self.maps])
+        shared = int(np.sum(state.landmarks.rows_of(ids) >= 0))
         if self._comparisons.is_due(shared):
             self.enter(state)
         if not self.is_localised:
@@ -135,9 +148,8 @@ class Localiser:
 
     def pose_by_tag(self, state: State) -> TagPose | None:
         """Return the pose in the map by a single tag, where it is not known; None if none is."""
-        if self.loaded is None or self.is_localised:
-            return None
-        return pose_by_tag(state, self.loaded, self._refused)
+        known = None if self.is_localised else self._named(state)
+        return None if known is None else pose_by_tag(state, known, self._refused)
 
     def try_tag(self, tag_id: int) -> None:
         """Note that the pose on trial was given by a tag."""
@@ -156,28 +168,30 @@ class Localiser:
             return ''
         places = [place for place in self.places if place.share > LEAST_SHARE]
         if not places:
-            return 'what was seen fits no place in the map yet: drive on, or give the pose'
-        fits = ' and '.join(_name(place.transform @ A) for place in places[:MAX_NAMED])
+            return f'what was seen fits no place in {self._where} yet: drive on, or give the pose'
+        fits = ' and '.join(self._name(place, A) for place in places[:MAX_NAMED])
         if len(places) > MAX_NAMED:
             fits += f' and {len(places) - MAX_NAMED} more'
         elif len(places) == 1:
             fits += f', right with a probability of {places[0].share:.2f}'
         number = f'{len(places)} places' if len(places) > 1 else 'one place'
-        return f'what was seen fits {number} in the map, {fits}: drive on, or give the pose'
+        return f'what was seen fits {number} in {self._where}, {fits}: drive on, or give the pose'
 
     def _find(self, state: State) -> None:
         """Find the pose by landmarks without ids."""
-        if self.loaded is None or not len(self.loaded.ids) or state.filter.joint is None:
+        if not len(self.maps[0].ids) or state.filter.joint is None:
             return
         if self._finder is None:
-            self._finder = Finder(self.loaded, state, self._rough)
+            self._finder = Finder(self.maps, state, self._rough)
         found, places = self._finder.find(state), self._finder.places
-        if found is not None and places is not None and enter_map(state, self.loaded, found):
+        if found is not None and places is not None and enter_map(state, *found):
+            self.loaded, (rows, _) = found
             self.is_localised = True
             logger.info(
-                'Found the pose in the map by %d of %d landmarks (wrong with a probability of '
+                'Found the pose in the map%s by %d of %d landmarks (wrong with a probability of '
                 '%.0e).',
-                len(found[0]),
+                f' {self.loaded.name}' if len(self.maps) > 1 else '',
+                len(rows),
                 len(places.all[0].rows),
                 places.error_probability,
             )
@@ -187,11 +201,34 @@ class Localiser:
             logger.warning('%s%s.', problem[0].upper(), problem[1:])
 
     def enter(self, state: State) -> bool:
-        """Move an estimate into the frame of the loaded map, if the landmarks suffice."""
-        if self.loaded is not None and enter_map(state, self.loaded):
-            self.is_localised = True
-            logger.info('Found the pose in the map of %d landmarks.', len(self.loaded.ids))
+        """Move an estimate into the frame of a loaded map, if landmarks with ids suffice."""
+        known = self._named(state)
+        if known is not None and enter_map(state, known):
+            self.loaded, self.is_localised = known, True
+            name = f'{known.name} ' if len(self.maps) > 1 else ''
+            logger.info('Found the pose in the map %sof %d landmarks.', name, len(known.ids))
         return self.is_localised
+
+    def _named(self, state: State) -> LandmarkMap | None:
+        """Return the only map, or the only one of several that has any of the ids seen."""
+        if len(self.maps) == 1:
+            return self.maps[0]
+        ids = state.landmarks.ids
+        seen = ids[~is_automatic(ids)]
+        named = [known for known in self.maps if np.isin(seen, known.ids).any()]
+        return named[0] if len(named) == 1 else None
+
+    @property
+    def _where(self) -> str:
+        """What is searched, in words."""
+        return 'the map' if len(self.maps) == 1 else f'the {len(self.maps)} maps'
+
+    def _name(self, place: Place, A: FloatArray) -> str:
+        """Return where the robot is at a place, by Â (4, 4), in words."""
+        pose = place.transform @ A
+        x, y = pose[:2, 3]
+        there = f'({x:.1f} m, {y:.1f} m, {math.atan2(pose[1, 0], pose[0, 0]):.2f} rad)'
+        return there if len(self.maps) == 1 else f'{there} in {self.maps[place.map_index].name}'
 
 
 def is_lost(state: State) -> bool:
@@ -252,9 +289,3 @@ class PoseTrial:
         self._for += int(accepted > 0 and accepted >= rejected)
         self._against += int(rejected > accepted)
         return self._against >= often and self._against > self._for
-
-
-def _name(pose: FloatArray) -> str:
-    """Return a pose (4, 4) in words."""
-    x, y = pose[:2, 3]
-    return f'({x:.1f} m, {y:.1f} m, {math.atan2(pose[1, 0], pose[0, 0]):.2f} rad)'

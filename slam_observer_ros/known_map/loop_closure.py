@@ -47,6 +47,10 @@ NEIGHBOURS = 3
 """Landmarks next to one to which distances say how well it is known where it lies there."""
 
 
+SHOULD_BE_SEEN = 3.0
+"""−ln of the probability below which it is no chance that a landmark in view is not seen."""
+
+
 class LoopClosure:
     """Merges landmarks of one map that are one."""
 
@@ -55,6 +59,7 @@ class LoopClosure:
         self._searched: tuple[bytes, int] | None = None
         self._apart: set[tuple[int, int]] = set()  # ids that were seen at once, side by side
         self._near_m = math.inf  # how far side by side is
+        self._doubled: set[tuple[int, int]] = set()  # ids that were counted as such
 
     def note(self, state: State, stamp_ns: int) -> None:
         """Note which landmarks an observation, already used, has shown to be two."""
@@ -103,6 +108,36 @@ class LoopClosure:
             own -= own > pair[1]
             merged += 1
         return merged
+
+    def count_doubled(self, state: State) -> None:
+        """Count landmarks that were added where known ones should be seen, and are not.
+
+        By their joint covariance they can't be these, or they would be merged.
+        """
+        landmarks, known = state.landmarks, state.confirmed
+        missed = landmarks.missed[known]
+        absent = known[-missed * math.log1p(-landmarks.likely_share) > SHOULD_BE_SEEN]
+        added = known[is_automatic(landmarks.ids[known]) & (missed == 0)]
+        if not len(absent) or not len(added):
+            return
+        points = state.filter.points[:, : state.axes.point]
+        off_m = np.linalg.norm(points[absent][:, None] - points[added], axis=2)
+        is_since = landmarks.born_ns[added] > landmarks.last_seen_ns[absent][:, None]
+        # Nearer to a known one than half as far as this is from the robot, or from a third one.
+        others = np.setdiff1d(known, added)
+        to_others_m = np.linalg.norm(points[absent][:, None] - points[others], axis=2)
+        to_others_m[absent[:, None] == others] = np.inf
+        ranges_m = np.linalg.norm(points[absent] - state.observer.A[: state.axes.point, 3], axis=1)
+        reach_m = 0.5 * np.minimum(ranges_m, to_others_m.min(axis=1))
+        at, new = np.nonzero(is_since & (off_m < reach_m[:, None]))
+        if not len(at):
+            return
+        r, S = _differences(state, absent[at], added[new])
+        differ = mahalanobis(r, S) ** 2 > MOST * state.axes.point
+        pairs = np.column_stack([landmarks.ids[absent[at]], landmarks.ids[added[new]]])[differ]
+        doubled = {(int(old), int(own)) for old, own in pairs} - self._doubled
+        state.counts['doubled_landmark'] += len(doubled)
+        self._doubled |= doubled
 
     def _twins(self, state: State, own: IntArray) -> tuple[IntArray, IntArray] | None:
         """Return the row of a landmark and that of one which it certainly is, (1,) each."""

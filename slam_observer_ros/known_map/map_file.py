@@ -144,9 +144,30 @@ def read_map(path: Path) -> LandmarkMap:
     except YamlError as error:
         raise MapError(f'map {path} is not valid YAML: {error}') from error
     try:
-        return _parse(content)
+        return dataclasses.replace(_parse(content), name=path.stem)
     except MapError as error:
         raise MapError(f'map {path}: {error}') from error
+
+
+def read_maps(path: Path) -> list[LandmarkMap]:
+    """Read a map, or all of a folder, in one of which the robot is.
+
+    Raise :exc:`MapError` as :func:`read_map` does, or if there is none in the folder.
+    """
+    return [read_map(file) for file in map_files(path)]
+
+
+def map_files(path: Path) -> list[Path]:
+    """Return the file of a map, or those of a folder, by name; MapError if there are none."""
+    try:
+        if not path.is_dir():
+            return [path]
+        files = sorted(file for file in path.iterdir() if file.suffix in ('.yaml', '.yml'))
+    except OSError as error:
+        raise MapError(f"can't read map {path}: {error.strerror}") from error
+    if not files:
+        raise MapError(f'there is no map, a file *.yaml, in the folder {path}')
+    return files
 
 
 def _plain_value(text: str) -> object:

@@ -58,7 +58,8 @@ def enter_map(
     found = _find_frame(state, rows, known.select(shared))
     if found is None:
         return False
-    state.observer.reference_pose, agree = found
+    transform, agree = found
+    state.observer.set_reference_pose(transform)
     named = np.flatnonzero(
         np.isin(state.landmarks.ids, known.ids) & ~is_automatic(state.landmarks.ids)
     )

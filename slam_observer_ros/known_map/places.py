@@ -10,6 +10,7 @@ is a twentieth): so chance seldom gives a place a large share.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Protocol
@@ -51,6 +52,9 @@ NOWHERE = 0.1
 LEAST_VIEW_M = 1.0
 """Radius of what is in view at least, metres."""
 
+LEAST_STD = 1e-3
+"""Standard deviation of a given pose at least, rad and m."""
+
 SAMPLED = 64
 """Landmarks around which others are counted, to know how many are in view anywhere."""
 
@@ -81,6 +85,7 @@ class Place:
     rows: IntArray  # (m,) the landmark that each point is, −1 for none
     log_mass: float
     share: float = 0.0  # probability that it is here
+    map_index: int = 0  # in which of several maps
 
     @property
     def matches(self) -> int:
@@ -94,6 +99,32 @@ class Places:
 
     all: list[Place]
     is_complete: bool  # none that could matter is missing
+    log_none: float  # ln of the mass of 'none of them'
+
+    @classmethod
+    def weighed(cls, found: Sequence[Place], log_none: float, is_complete: bool) -> Places:
+        """Return places with their shares."""
+        masses = np.array([place.log_mass for place in found] + [log_none])
+        shares = np.exp(masses - masses.max())
+        shares /= shares.sum()
+        weighed = [
+            replace(place, share=float(share))
+            for place, share in zip(found, shares[:-1], strict=True)
+        ]
+        by_share = sorted(weighed, key=lambda place: -place.share)
+        return cls(by_share, is_complete, log_none)
+
+    @classmethod
+    def in_several_maps(cls, parts: Mapping[int, Places]) -> Places:
+        """Return the places in all of several maps, any of which the robot may be in alike."""
+        log_maps = math.log(len(parts))
+        found = [
+            replace(place, map_index=i, log_mass=place.log_mass - log_maps)
+            for i, part in parts.items()
+            for place in part.all
+        ]
+        is_complete = all(part.is_complete for part in parts.values())
+        return cls.weighed(found, next(iter(parts.values())).log_none, is_complete)
 
     def decided(self, error_probability: float) -> Place | None:
         """Return the place that is wrong with at most this probability, if there is one."""
@@ -136,7 +167,8 @@ class Near:
 
     def __init__(self, pose: FloatArray, covariance: FloatArray, axes: EstimatedAxes) -> None:
         self._pose, self._axes = pose, axes
-        self._root = np.linalg.cholesky(covariance[axes.pose, axes.pose])
+        P = covariance[axes.pose, axes.pose] + LEAST_STD**2 * np.eye(axes.p)
+        self._root = np.linalg.cholesky(P)
         log_scale = float(np.log(np.diagonal(self._root)).sum())
         self.largest = -log_scale - 0.5 * axes.p * math.log(2.0 * math.pi)
 
@@ -222,17 +254,6 @@ class Weighing:
                 found[i] = replace(first, log_mass=mass)
                 return
         found.append(place)
-
-    def places(self, found: list[Place], is_complete: bool) -> Places:
-        """Return places with their shares."""
-        masses = np.array([place.log_mass for place in found] + [self.log_none])
-        shares = np.exp(masses - masses.max())
-        shares /= shares.sum()
-        weighed = [
-            replace(place, share=float(share))
-            for place, share in zip(found, shares[:-1], strict=True)
-        ]
-        return Places(sorted(weighed, key=lambda place: -place.share), is_complete)
 
     def _mass(self, log_likelihood: float, n: int, in_view: int) -> float:
         """Return ln of the mass of n matches, by how many landmarks are in view; no prior yet."""

@@ -24,6 +24,7 @@ class TagPose:
     tag_id: int
     pose: FloatArray  # (4, 4) in the map
     covariance: FloatArray  # (6, 6) of rotation vector and position, rad² and m², map axes
+    known: LandmarkMap  # the map
 
 
 def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> TagPose | None:
@@ -59,4 +60,4 @@ def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> 
         relative = np.zeros((3, 3))
         relative[:k, :k] = seen
         covariance[3:, 3:] += pose[:3, :3] @ relative @ pose[:3, :3].T
-    return TagPose(int(known.ids[at]), pose, covariance)
+    return TagPose(int(known.ids[at]), pose, covariance, known)

@@ -74,7 +74,10 @@ ARGUMENTS = {
     'odometry': ('~/odometry', 'topic of the estimate'),
     'pose': ('amcl_pose', 'topic of the pose'),
     'base_frame': ('', 'frame of the robot; empty: as params_file says'),
-    'map_file': ('', 'landmarks to be localised among; empty: as params_file says'),
+    'map_file': (
+        '',
+        'landmarks to be localised among, or a folder of such maps; empty: as params_file says',
+    ),
     'tag_size': ('', 'edge of square tags, metres; empty: as params_file says'),
     'map': ('', 'occupancy grid for a map server, a YAML file; empty: none is started'),
 }

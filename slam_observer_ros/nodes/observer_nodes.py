@@ -172,7 +172,7 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
         service.callback = change_if_possible
 
     def _attempt(self, act: Callable[[], None], says: str = '') -> TransitionCallbackReturn:
-        """Do a part of a transition; log why it fails, of which rclpy says nothing."""
+        """Do a part of a transition; log why it fails: rclpy does not."""
         try:
             act()
         except SlamObserverError as error:

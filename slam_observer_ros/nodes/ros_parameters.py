@@ -34,7 +34,7 @@ INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 class RepeatableParameters(GuardedNode):
     """A node where setting a parameter to the value that it has is no failure.
 
-    rclpy refuses that for those that are read-only, which most of a dumped file are.
+    rclpy refuses that for read-only ones, and most of a dumped file are read-only.
     """
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
@@ -118,7 +118,7 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
 
 
 def _check_names(node: Node, names: Collection[str]) -> None:
-    """Raise ParameterError if a name that is set is misspelt; warn of those that are unlike."""
+    """Raise ParameterError if a name that is set is misspelt; warn of names unlike any."""
     # rclpy, unlike rclcpp, has no public name for what the command line and files set.
     written = [
         name

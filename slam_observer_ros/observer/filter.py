@@ -8,8 +8,9 @@ covariances (m, 3, 3), m².
 
 from __future__ import annotations
 
+from copy import copy
 import math
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from slam_observer_ros.sensor_models.calibration import Calibration, without_sen
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.settings.estimator_settings import Settings
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 """Settings without effect on other filters; ``gain_k`` is in the Lyapunov value of all."""
@@ -58,6 +62,14 @@ class Filter:
         estimated = settings if self.has_joint_covariance else without_sensor_calibration(settings)
         self.calibration = Calibration(estimated, self.axes)  # of velocities and sensors
         self.motion_noise = MotionNoise(settings)
+
+    def copy(self) -> Self:
+        """Return an independent copy."""
+        other = copy(self)
+        other.observer = self.observer.copy()
+        other.calibration = self.calibration.copy()
+        other.motion_noise = self.motion_noise.copy()
+        return other
 
     # The step (27)-(31)
 
@@ -160,7 +172,7 @@ class Filter:
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose`` (4, 4), ε of ``covariance`` (6, 6) independent of all."""
-        self.observer.A = pose
+        self.observer.set_pose(pose)
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate to where m of its landmarks are known to be.

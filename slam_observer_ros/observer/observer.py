@@ -11,18 +11,14 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.observer.arrays import FilterArrays
 
 
-class Observer:
-    """State X̂ on SLAM_n(3) with its reference ξ°."""
+class Observer(FilterArrays):
+    """State X̂ on SLAM_n(3) with its reference ξ°: what the paper does to these arrays.
 
-    def __init__(self, reference_pose: FloatArray) -> None:
-        self.reference_pose = reference_pose  # (4, 4) P°, body to world
-        self.A: FloatArray = np.eye(4)  # (4, 4) Â
-        self.a: FloatArray = np.empty((0, 3))  # (n, 3) â_i
-        self.y_ref: FloatArray = np.empty((0, 3))  # (n, 3) y_i°
-        self.u: FloatArray = np.empty((0, 3))  # (n, 3) velocities R_Â v_i, m/s; zero at rest
-        self.have_moved = False  # whether any landmark has had a velocity so far
+    What methods return are copies.
+    """
 
     @property
     def pose(self) -> FloatArray:
@@ -59,8 +55,9 @@ class Observer:
 
     def propagate(self, path: FloatArray) -> None:
         """Advance Â to the end of a ``path`` (k + 1, 4, 4), along which it is Â exp(V dt) (27)."""
-        self.A = path[-1].copy()
-        self.A[:3, :3] = so3.normalise(self.A[:3, :3])
+        A = self.A
+        A[...] = path[-1]
+        A[:3, :3] = so3.normalise(A[:3, :3])
 
     def move_landmarks(self, duration_s: float) -> None:
         """Add R_Â v_i dt to â_i, where (27) has zero: here landmarks may have velocities (19)."""
@@ -72,12 +69,12 @@ class Observer:
 
         To first order D (4, 4) = exp(Δ dt), and d_i + R_D â_i − â_i = δ_i dt (28).
         """
-        self.A = D.dot(self.A)  # (28), Δ for a finite time
+        self.A[...] = D.dot(self.A)  # (28), Δ for a finite time
         self.a[rows] = self.a[rows].dot(D[:3, :3].T) + d  # (28), δ_i
 
     def correct_velocities(self, D: FloatArray, change: FloatArray) -> None:
         """Turn the landmarks' velocities by D (4, 4), and add ``change`` (n, 3), m/s."""
-        self.u = se3.rotate(D, self.u) + change
+        self.u[...] = se3.rotate(D, self.u) + change
         self.have_moved = True
 
     def add_landmarks(self, points: FloatArray) -> None:
@@ -86,9 +83,8 @@ class Observer:
 
     def add_reference_landmarks(self, y_ref: FloatArray) -> None:
         """Append landmarks with given y_i° (m, 3), metres, and â_i = 0."""
-        self.y_ref = np.concatenate([self.y_ref, y_ref])
-        self.a = np.concatenate([self.a, np.zeros_like(y_ref)])
-        self.u = np.concatenate([self.u, np.zeros_like(y_ref)])
+        rows = self.append_zeros(len(y_ref))
+        self.y_ref[rows] = y_ref
 
     def relocate_landmarks(self, rows: IntArray, points: FloatArray) -> None:
         """Put landmarks, at rest, where they are seen: y_i° = Â y_i with ``points`` y_i (m, 3)."""
@@ -97,22 +93,28 @@ class Observer:
 
     def fix_landmarks(self, y_ref: FloatArray) -> None:
         """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest."""
-        self.set_reference(y_ref)
-        self.u = np.zeros_like(y_ref)
+        self.delete(np.arange(len(self)))
+        self.add_reference_landmarks(y_ref)
         self.have_moved = False
 
     def set_reference(self, y_ref: FloatArray) -> None:
         """Put the landmarks at ``y_ref`` (n, 3), reference frame, with â_i = 0."""
-        self.y_ref = y_ref
-        self.a = np.zeros(y_ref.shape)
+        self.y_ref[...] = y_ref
+        self.a[...] = 0.0
 
     def remove_landmarks(self, rows: IntArray) -> None:
         """Delete the landmarks at ``rows``; those behind move up."""
-        self.y_ref = np.delete(self.y_ref, rows, axis=0)
-        self.a = np.delete(self.a, rows, axis=0)
-        self.u = np.delete(self.u, rows, axis=0)
+        self.delete(rows)
 
     def set_landmark_velocities(self, rows: IntArray, velocities: FloatArray) -> None:
         """Let landmarks move at ``velocities`` v_i (m, 3), m/s, body frame now, or rest (19)."""
         self.u[rows] = se3.rotate(self.A, velocities)
         self.have_moved = self.have_moved or bool(velocities.any())
+
+    def set_pose(self, A: FloatArray) -> None:
+        """Put the robot at Â = ``A`` (4, 4)."""
+        self.A[...] = A
+
+    def set_reference_pose(self, pose: FloatArray) -> None:
+        """Let P° be ``pose`` (4, 4), body to world: all that is estimated moves with it."""
+        self.reference_pose[...] = pose

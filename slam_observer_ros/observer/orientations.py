@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from slam_observer_ros.common.columns import LandmarkColumns
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 
@@ -43,28 +45,25 @@ class SeenOrientations:
         )
 
 
-class LandmarkOrientations:
+class LandmarkOrientations(LandmarkColumns):
     """B̂_i of n landmarks in the frame of P°, all zero for those that have none (yet)."""
 
-    def __init__(self) -> None:
-        self.B: FloatArray = np.empty((0, 3, 3))
-        # (n,) how often each was seen and accepted, and rejections in a row up to now
-        self.counts: IntArray = np.empty(0, dtype=np.int64)
-        self.rejections: IntArray = np.empty(0, dtype=np.int64)
-        # (n,) standard deviations, rad, of those that are known by a map
-        self.map_sigmas: FloatArray = np.empty(0)
+    COLUMNS: ClassVar = {
+        'B': (np.float64, (3, 3)),
+        'counts': (np.int64, ()),
+        'rejections': (np.int64, ()),
+        'map_sigmas': (np.float64, ()),
+    }
+    B: FloatArray  # (n, 3, 3)
+    # (n,) how often each was seen and accepted, and rejections in a row up to now
+    counts: IntArray
+    rejections: IntArray
+    map_sigmas: FloatArray  # (n,) standard deviations, rad, of those that are known by a map
 
     @property
     def are_known(self) -> BoolArray:
         """(n,) which landmarks have an orientation."""
         return np.asarray(self.B.any(axis=(1, 2)))
-
-    def add(self, m: int) -> None:
-        """Append landmarks without orientation."""
-        self.B = np.concatenate([self.B, np.zeros((m, 3, 3))])
-        self.counts = np.append(self.counts, np.zeros(m, dtype=np.int64))
-        self.rejections = np.append(self.rejections, np.zeros(m, dtype=np.int64))
-        self.map_sigmas = np.append(self.map_sigmas, np.zeros(m))
 
     def put(self, rows: IntArray, B: FloatArray) -> None:
         """Let landmarks have orientations (m, 3, 3), seen once."""
@@ -79,16 +78,9 @@ class LandmarkOrientations:
         """Let landmarks have no orientation."""
         self.B[rows] = 0.0
 
-    def remove(self, rows: IntArray) -> None:
-        """Delete landmarks; those behind move up."""
-        self.B = np.delete(self.B, rows, axis=0)
-        self.counts = np.delete(self.counts, rows)
-        self.rejections = np.delete(self.rejections, rows)
-        self.map_sigmas = np.delete(self.map_sigmas, rows)
-
     def turn(self, omega: FloatArray) -> None:
         """Turn all of them, B̂_i ← exp(ω_i) B̂_i, by rotation vectors (n, 3)."""
-        self.B = so3.exp(omega) @ self.B
+        self.B[...] = so3.exp(omega) @ self.B
 
     def count(self, rows: IntArray, accepted: BoolArray) -> None:
         """Count which orientations (m,) were accepted; all others were rejected."""

@@ -114,11 +114,11 @@ def replay(
     events: Iterable[Event | VelocityBlock],
     settings: Settings,
     truth: Truth | None = None,
-    landmark_map: LandmarkMap | None = None,
+    landmark_map: LandmarkMap | Sequence[LandmarkMap] | None = None,
     keep_all: bool = True,
     recorders: Sequence[Recorder | StampRecorder] = (),
 ) -> Replay:
-    """Run events through an estimator, from where the settings say or anywhere in a known map.
+    """Run events through an estimator, from where the settings say, or in known maps.
 
     The events are in the order in which they were received; the truth is what the configuration
     error is measured against. Where not all is kept, memory does not grow with the recording:
@@ -138,7 +138,7 @@ class _RunningReplay:
         self,
         settings: Settings,
         truth: Truth | None,
-        landmark_map: LandmarkMap | None,
+        landmark_map: LandmarkMap | Sequence[LandmarkMap] | None,
         keep_all: bool,
         recorders: Sequence[Recorder | StampRecorder],
     ) -> None:

@@ -8,6 +8,7 @@ sensor's part, which begins with the first observation from its frame, is in
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 import math
 
@@ -77,6 +78,13 @@ class Calibration:
         self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
         self._set_variances(errors[self._estimated] ** 2)
 
+    def copy(self) -> Calibration:
+        """Return an independent copy."""
+        other = copy(self)
+        other._all = self._all.copy()
+        other.sensors = {frame: copy(sensor) for frame, sensor in self.sensors.items()}
+        return other
+
     def _set_variances(self, variances: FloatArray) -> None:
         self.initial_variances = variances
         self.drift_covariance = np.diag(variances * self._settings.calibration_drift**2)
@@ -143,7 +151,7 @@ class Calibration:
         ]
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so."""
+        """Return velocities (…, 6) as (1 + s) ∘ V + b; exact zeros stay so."""
         # Wheels that stand turn no robot, however unlike, and no gyroscope gives zero on all axes.
         biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
         return body_velocities * self._all[:6] + biases

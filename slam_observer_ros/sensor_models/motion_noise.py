@@ -20,6 +20,7 @@ innovations are small while errors are large.
 
 from __future__ import annotations
 
+from copy import copy
 from functools import lru_cache
 import math
 
@@ -87,6 +88,12 @@ class MotionNoise:
         )
         self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
         self._has_scale = bool(self._scale.any())
+
+    def copy(self) -> MotionNoise:
+        """Return an independent copy."""
+        other = copy(self)
+        other.factors = copy(self.factors)  # whose arrays are never changed in place
+        return other
 
     def covariances(self, held: HeldVelocities) -> FloatArray:
         """Return what k motions may be off by: (k, 6, 6), rad² and m²."""

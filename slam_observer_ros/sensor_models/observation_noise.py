@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, Immutable
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.matrices import limited
 from slam_observer_ros.sensor_models.fiducial_noise import (
@@ -38,7 +38,7 @@ _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 
 
-class ObservationNoise(Immutable):
+class ObservationNoise:
     """How far observed points may be off, as ``observation_model`` and its figures say.
 
     ``error_time_s`` is the correlation time of the errors, see :func:`repetition_factors`.
@@ -121,7 +121,7 @@ def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
 
 
 def _invertible(covariances: FloatArray) -> FloatArray:
-    """Return covariances (m, 3, 3) of which no direction is known exactly."""
+    """Return covariances (m, 3, 3) with no direction known exactly."""
     least = RESOLUTION_M**2 + MIN_SHARE * covariances.trace(axis1=1, axis2=2)
     invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
     return invertible

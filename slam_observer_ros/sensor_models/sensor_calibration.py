@@ -55,7 +55,7 @@ class SensorCalibration:
         found = []
         for i, variance, error in zip(self.estimated, variances, stated, strict=True):
             value, nominal, factor = self.values[i], self._stated[i], 1.0
-            if i == SCALE:  # of which s is the logarithm
+            if i == SCALE:  # s is its logarithm
                 value, nominal = math.exp(value), math.exp(nominal)
                 factor = value
             found.append(

@@ -47,7 +47,7 @@ class VelocityHistory:
         # In force from each stamp to the next; the first is what is known before any event.
         self._stamps_ns = [NEVER_NS]
         self._joined = _Joined.with_room_for(FIRST_CAPACITY)
-        # Those that nobody has asked for yet: many written at once cost less than one by one.
+        # Nobody has asked for these yet: many written at once cost less than one by one.
         self._unwritten: list[_InForce] = []
         self._velocity: VelocityEvent | None = None
         self._angular: AngularVelocityEvent | None = None
@@ -239,7 +239,7 @@ class VelocityHistory:
         return angular_s, linear_s
 
     def _written(self) -> _Joined:
-        """Return all velocities, those that have come since the last time among them."""
+        """Return all velocities, including what has come since the last time."""
         count = len(self._stamps_ns)
         if count > self._joined.capacity:
             self._joined = self._joined.copied(slice(None), 2 * count)

@@ -23,7 +23,7 @@ def parameter_file_text(rows: Iterable[Parameter], values: Mapping[str, Value]) 
 
 
 def value_text(value: object) -> str:
-    """Return a value as YAML of which ROS reads the type: numbers with a point, as 1.0e-06."""
+    """Return a value as YAML whose type ROS reads right: numbers with a point, as 1.0e-06."""
     if isinstance(value, (tuple, list)):
         return f'[{", ".join(value_text(entry) for entry in value)}]'
     if isinstance(value, float):

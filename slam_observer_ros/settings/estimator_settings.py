@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from slam_observer_ros.common.types import Immutable
 from slam_observer_ros.settings.parameter_table import parameter
 
 Vector3 = tuple[float, float, float]
@@ -18,7 +17,7 @@ MAX_POSITION_M = 1e7
 
 
 @dataclass(frozen=True)
-class Settings(Immutable):
+class Settings:
     """Settings of the estimator; each field is a parameter."""
 
     gains: str = parameter(

@@ -105,7 +105,8 @@ class ObserverNodeSettings(InputSettings):
     )
     map_file: str = parameter(
         '',
-        'Map to load at the start: one saved earlier, or surveyed landmarks; empty for none',
+        'Map to load at the start: one saved earlier, or surveyed landmarks; a folder of maps, in '
+        'one of which the robot is found; empty for none',
         basic=True,
     )
     map_path: str = parameter(

@@ -103,14 +103,14 @@ class History:
         self._end = prior.pose
         self._slip: Motion | None = None
         self._motion_noise, self._sensitivity, self._drift = self._at_rest()
-        # Keyframes as arrays: those that are summarised, in pieces, and those that are not.
+        # Keyframes as arrays: the summarised ones, in pieces, and the others.
         q = 0 if prior.orientations is None else axes.turn
         self._none = no_keyframes(axes.p, len(prior.calibration), axes.point, q)
         self._summarised: list[Keyframes] = []
         self._latest = self._none
         self._new: list[_Step] = []
 
-    def __deepcopy__(self, memo: dict[int, object]) -> History:
+    def copy(self) -> History:
         """Return an independent history: no array is ever changed in place."""
         other = copy(self)
         for name, value in vars(self).items():

@@ -12,7 +12,7 @@ from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 
 @dataclass(frozen=True, slots=True)
 class SeenTurns:
-    """How the tags of M observed points are turned; zero for those that show no orientation."""
+    """How the tags of M observed points are turned; zero where they show no orientation."""
 
     Z: FloatArray  # (M, 3, 3) from the tag's own axes to the body's
     flipped: FloatArray  # (M, 3, 3) the other orientation that looks nearly the same

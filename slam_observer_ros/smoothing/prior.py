@@ -15,7 +15,7 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 
 ANYWHERE_M = 1e3
-"""Standard deviation of a landmark of which nothing is known, metres."""
+"""Standard deviation of an unknown landmark, metres."""
 
 EXACT_M = 1e-6
 """Standard deviation of what is said to be exact, metres."""

@@ -7,7 +7,7 @@ how far its corrections have turned the robot.
 What was relinearised stays as it is: from then on a summary stands for it, in coordinates in
 which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a blind stretch
 there may be no such summary until landmarks seen before are seen again. Else the cost does not
-grow with the history, of which only :meth:`Relinearisation.smooth` needs all.
+grow with the history; only :meth:`Relinearisation.smooth` needs all of it.
 
 It is O(n³) for n landmarks. In a map without a dense covariance (:mod:`.compressed_covariance`)
 nothing is relinearised any more. Its history goes on, to be smoothed, until it would have to begin
@@ -17,6 +17,7 @@ again: then it is given up. Among tags the covariance stays dense, but from
 
 from __future__ import annotations
 
+from copy import copy
 import logging
 import math
 from typing import Protocol
@@ -24,7 +25,7 @@ from typing import Protocol
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError, SmoothingError
-from slam_observer_ros.common.types import FloatArray, Immutable, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.observer.observer import Observer
@@ -108,6 +109,13 @@ class Relinearisation:
         self._turn_squared = self._largest_turn = 0.0
         self.reset('the last start')
 
+    def copy(self, filter_: JointFilter) -> Relinearisation:
+        """Return an independent copy for a copy of the filter."""
+        other = copy(self)
+        other._filter, other._observer = filter_, filter_.observer
+        other._calibration, other.history = filter_.calibration, self.history.copy()
+        return other
+
     @property
     def is_active(self) -> bool:
         """Whether there is a history."""
@@ -144,7 +152,7 @@ class Relinearisation:
         """
         if not len(keyframe.rows):  # says nothing: the motions before and after it add up
             return
-        self.history.add(keyframe, self._observer.A, self._calibration.values)
+        self.history.add(keyframe, self._observer.A.copy(), self._calibration.values)
         self._seen += 1
         self._observations += 1
         if not self._joint.is_dense:
@@ -259,7 +267,7 @@ class Relinearisation:
     @property
     def _is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
-        if self._is_overdue:  # it could not be summed up for a landmark in doubt
+        if self._is_overdue:  # a landmark that may have moved kept it from being summed up
             return True
         settings = self._settings
         least = max(
@@ -308,11 +316,11 @@ class Relinearisation:
         """Take the last step's start for the reference; the step is a correction from there.
 
         ``covariance`` belongs to that start. Taken for that of the step's end it would say
-        something of the gauge, of which nothing is known.
+        something of the gauge, which is unknown.
         """
         start, end, observer = step.start, step.end, self._observer
         # The reference and its covariance, in the coordinates of the filter.
-        observer.A = start.poses[-1]
+        observer.set_pose(start.poses[-1])
         observer.set_reference(start.points)
         P = _with_pose_error_by(observer.A, covariance, self._axes)
         self._joint.set_of_positions(P, start.points)
@@ -322,7 +330,7 @@ class Relinearisation:
         observer.correct(D, slice(None), end.points - start.points)
         tags = self._filter.orientations
         if tags is not None and end.orientations is not None:
-            tags.B = end.orientations
+            tags.B[...] = end.orientations
 
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
         calibration, sensed = self._calibration, None
@@ -356,7 +364,7 @@ class Relinearisation:
             P = joint.of_positions(points)
         P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)
         values = self._calibration.values
-        return Prior(observer.A, values, points, P, orientations=self._orientations())
+        return Prior(observer.A.copy(), values, points, P, orientations=self._orientations())
 
     def _orientations(self) -> FloatArray | None:
         """Return those of the landmarks (n, 3, 3), if they are estimated."""
@@ -374,7 +382,7 @@ def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> Fl
     return changed
 
 
-class _Warning(Immutable):
+class _Warning:
     """A warning that is given once by all copies of its owner: hypotheses are copies."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Which slips the whole history confirms, of those that a filter has believed in.
+"""Which of the slips that a filter has believed in the whole history confirms.
 
 A filter takes the robot for slipped by what it has seen until then, which what follows may
 explain otherwise. A link that may be a slip has a thousand times the variance of one that is not,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
+from slam_observer_ros.common.columns import LandmarkColumns
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import is_automatic
@@ -17,64 +20,65 @@ Some are seen more seldom than others: from afar, or from one side only.
 TOO_SELDOM = 5
 """How many times more seldom than others a landmark may be seen that was confirmed once."""
 
+MIN_SHARE, MOST_SHARE = 0.1, 0.9
+"""How often a landmark in view is seen at least, as in a map that was loaded, and at most: one
+that was seen each time may yet be hidden.
+"""
+
 NEW_S, OLD_S = 60.0, 20.0
 """A landmark is new for so long, and an old one was not seen for so long, seconds."""
 
 MIN_LOOP = 5
 """New landmarks, and old ones, that can say by how they lie whether a loop has closed."""
 
-_COLUMNS = (
-    'ids',
-    'counts',
-    'rejections',
-    'rejected_at',
-    'rejected_last',
-    'last_seen_ns',
-    'seen_before_ns',
-    'tentative',
-    'in_view',
-    'passed',
-    'missed',
-    'born_ns',
-)
 
-
-class LandmarkTable:
+class LandmarkTable(LandmarkColumns):
     """Book-keeping of n landmarks; row i belongs to the observer's landmark i."""
 
+    COLUMNS: ClassVar = {
+        **dict.fromkeys(
+            (
+                'ids',
+                'counts',
+                'rejections',
+                'last_seen_ns',
+                'seen_before_ns',
+                'in_view',
+                'passed',
+                'missed',
+                'born_ns',
+            ),
+            (np.int64, ()),
+        ),
+        'tentative': (np.bool_, ()),
+        'rejected_at': (np.float64, (3,)),
+        'rejected_last': (np.float64, (3,)),
+    }
+    ids: IntArray  # (n,) in the order in which they were first seen
+    counts: IntArray  # (n,) in how many observations each was seen and accepted
+    rejections: IntArray  # (n,) rejections in a row, all at one position, up to now
+    # (n,) stamps of the latest observation and the one before it; −1 for none in this run
+    last_seen_ns: IntArray
+    seen_before_ns: IntArray
+    tentative: BoolArray  # (n,) which have no id, and have yet to be seen often enough to stay
+    # (n,) observations without ids that had it in view, and those since the one that saw it
+    in_view: IntArray
+    missed: IntArray
+    # (n,) those from another place than the one before: what hides one from a robot that stands
+    # hides it in all of them
+    passed: IntArray
+    # (n,) stamp at which each was seen for the first time; −1 for one that a map had
+    born_ns: IntArray
+    # (n, 3) its position at the first and the last of the rejections, metres, reference frame
+    rejected_at: FloatArray
+    rejected_last: FloatArray
+
     def __init__(self) -> None:
-        # (n,) ids, in the order in which they were first seen
-        self.ids: IntArray = np.empty(0, dtype=np.int64)
-        # (n,) in how many observations each was seen and accepted
-        self.counts: IntArray = np.empty(0, dtype=np.int64)
-        # (n,) rejections in a row, all at one position, up to now
-        self.rejections: IntArray = np.empty(0, dtype=np.int64)
-        # (n,) stamps of the latest observation and the one before it; −1 for none in this run
-        self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
-        self.seen_before_ns: IntArray = np.empty(0, dtype=np.int64)
-        # (n,) which have no id of their own, and have yet to be seen often enough to stay
-        self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
-        # (n,) observations without ids that had it in view, and those since the one that saw it
-        self.in_view: IntArray = np.empty(0, dtype=np.int64)
-        # (n,) those from another place than the one before: what hides one from a robot that
-        # stands hides it in all of them
-        self.passed: IntArray = np.empty(0, dtype=np.int64)
-        self.missed: IntArray = np.empty(0, dtype=np.int64)
-        # (n,) stamp at which each was seen for the first time; −1 for one that a map had
-        self.born_ns: IntArray = np.empty(0, dtype=np.int64)
-        # (n, 3) its position at the first and the last of the rejections, metres, reference frame
-        self.rejected_at: FloatArray = np.empty((0, 3))
-        self.rejected_last: FloatArray = np.empty((0, 3))
+        super().__init__()
         # how often those without ids that were confirmed were in view, and were seen
         self._confirmed_in_view = 0
         self._confirmed_seen = 0
-        # The rows in the order of their ids, and these.
-        self._order: IntArray = np.empty(0, dtype=np.int64)
-        self._sorted_ids: IntArray = self.ids
-
-    def __len__(self) -> int:
-        """Return the number of landmarks."""
-        return len(self.ids)
+        self._sort()
 
     def rows_of(self, ids: IntArray) -> IntArray:
         """Return the row of each id (m,), −1 where it is unknown."""
@@ -87,13 +91,9 @@ class LandmarkTable:
 
     def add(self, ids: IntArray, stamp_ns: int) -> None:
         """Append landmarks (m,) that are seen for the first time."""
-        first, m = len(self), len(ids)
-        for name in _COLUMNS:
-            column = getattr(self, name)
-            room = np.zeros((m, *column.shape[1:]), dtype=column.dtype)
-            setattr(self, name, np.concatenate([column, room]))
-        self.ids[first:] = ids
-        self.take_for_new(np.arange(first, first + m), stamp_ns)
+        rows = self.append_zeros(len(ids))
+        self.ids[rows] = ids
+        self.take_for_new(rows, stamp_ns)
         self._sort()
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
@@ -105,9 +105,7 @@ class LandmarkTable:
 
     def clear_time(self) -> None:
         """Take all landmarks as last seen before any stamp to come."""
-        self.last_seen_ns = np.full(len(self), -1)
-        self.seen_before_ns = np.full(len(self), -1)
-        self.born_ns = np.full(len(self), -1)
+        self.last_seen_ns[:] = self.seen_before_ns[:] = self.born_ns[:] = -1
 
     def renumber(self, rows: IntArray, ids: IntArray) -> None:
         """Give ``rows`` (m,) other ids (m,)."""
@@ -196,14 +194,24 @@ class LandmarkTable:
         self.passed[rows] += has_moved
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
 
+    def note_missed(self, rows: IntArray, seen: BoolArray) -> None:
+        """Count once more that rows (m,) in view were missed, but for those ``seen`` (n,)."""
+        self.missed[rows] = np.where(seen[rows], 0, self.missed[rows] + 1)
+
     def _sort(self) -> None:
-        self._order = np.argsort(self.ids)
-        self._sorted_ids = self.ids[self._order]
+        # The rows in the order of their ids, and these.
+        self._order: IntArray = np.argsort(self.ids)
+        self._sorted_ids: IntArray = self.ids[self._order]
 
     @property
     def seen_share(self) -> float:
         """How often a confirmed landmark without an id is seen while in view; 0 if unknown."""
         return self._confirmed_seen / self._confirmed_in_view if self._confirmed_in_view else 0.0
+
+    @property
+    def likely_share(self) -> float:
+        """The same, within what is likely."""
+        return min(max(self.seen_share, MIN_SHARE), MOST_SHARE)
 
     def unsupported(self, min_support: int) -> IntArray:
         """Return rows without an id that were seen too seldom to be landmarks.
@@ -253,6 +261,5 @@ class LandmarkTable:
 
     def remove(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""
-        for name in _COLUMNS:
-            setattr(self, name, np.delete(getattr(self, name), rows, axis=0))
+        self.delete(rows)
         self._sort()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from copy import copy
 
 import numpy as np
 
@@ -41,6 +42,16 @@ class State:
         self.observation_noise = ObservationNoise(settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
+
+    def copy(self) -> State:
+        """Return an independent copy: one copy of memory an array."""
+        other = copy(self)
+        other.filter = filter_ = self.filter.copy()
+        other.observer, other.motion_noise = filter_.observer, filter_.motion_noise
+        other.landmarks, other.counts = self.landmarks.copy(), self.counts.copy()
+        if self.relinearisation is not None:
+            other.relinearisation = self.relinearisation.copy(filter_)
+        return other
 
     @property
     def is_fixed(self) -> bool:
@@ -141,8 +152,9 @@ class State:
         observer = self.observer
         if not len(self.landmarks):
             # Else ε would turn about an origin that may be kilometres away.
-            observer.reference_pose = pose
-        observer.A = A = se3.inverse(observer.reference_pose) @ pose
+            observer.set_reference_pose(pose)
+        A = se3.inverse(observer.reference_pose) @ pose
+        observer.set_pose(A)
         given = np.zeros((6, 6)) if covariance is None else covariance
         self.filter.set_pose(A, covariances.of_pose_error(observer, given))
         self.was_contradicted = False

@@ -66,7 +66,7 @@ def _correct(state: State, residuals: Residuals) -> FloatArray:
     """Correct the state; return the weights (m,), 0 for a rejected landmark."""
     if not len(residuals.rows):
         return np.empty(0)
-    before = state.observer.A
+    before = state.observer.A.copy()
     weights = state.filter.correct(residuals)
     if state.relinearisation is not None:
         state.relinearisation.note_correction(before, state.observer.A)

@@ -34,7 +34,7 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
     seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
     if not len(seen.rows):
         return matched
-    before = state.observer.A
+    before = state.observer.A.copy()
     weights, are_unclear = state.filter.correct_by_orientations(seen)
     if state.relinearisation is not None:
         state.relinearisation.note_correction(before, state.observer.A)

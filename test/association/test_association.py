@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 import itertools
 from pathlib import Path
@@ -130,6 +129,7 @@ def test_false_points_among_those_without_ids_leave_few_landmarks_behind(seed):
     estimator = gain_worlds.estimate(with_false_points(world, 0.05, seed), PLANAR)
     assert estimator.counts['unsupported_landmark'] > 20
     assert len(estimator.landmark_ids) <= len(named.landmark_ids) + 3
+    assert estimator.counts['doubled_landmark'] == 0
     assert_allclose(estimator.pose, named.pose, atol=0.1)
 
 
@@ -275,11 +275,11 @@ def test_states_that_took_two_look_alikes_for_each_other_are_one_where_their_map
     state = estimator._hypotheses.best
     event = ObservationEvent(0, np.array([4, 5]), points)
     swapped = replace(event, ids=event.ids[::-1])
-    other, elsewhere = deepcopy(state), deepcopy(state)
+    other, elsewhere = state.copy(), state.copy()
     assert are_one(state, event, other, swapped)
     other.observer.relocate_landmarks(np.array([1]), points[1:] + 1.0)
     assert not are_one(state, event, other, swapped), 'each has a point where the other has none'
-    elsewhere.observer.A = elsewhere.observer.A @ se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
+    elsewhere.observer.A[...] = elsewhere.observer.A @ se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
     assert not are_one(state, event, elsewhere, swapped), 'the robot is 1 m off'
 
 
@@ -677,6 +677,24 @@ def test_reflectors_that_come_one_a_message_are_all_kept():
     assert estimator.counts['unsupported_landmark'] == 0
 
 
+@pytest.mark.parametrize('loaded', [False, True], ids=['mapped', 'loaded'])
+@pytest.mark.parametrize('shift_m', [0.0, 0.8])
+def test_a_landmark_added_where_a_known_one_should_be_seen_is_said(shift_m, loaded, caplog):
+    """The robot is moved on its stand, which nobody told it."""
+    random, estimator = np.random.default_rng(0), Estimator(PLANAR)
+    post = np.array([[3.0, 0.0, 0.0]])
+    if loaded:
+        surveyed = np.array([1e-4 * np.eye(3)])
+        estimator.load_map(LandmarkMap(np.array([7]), post, surveyed, np.array([0])), np.eye(4))
+    for step in range(120):
+        stand(estimator, 0.1 * step)
+        noise = random.normal(scale=0.02, size=3) * [1.0, 1.0, 0.0]
+        observe(estimator, 0.1 * step, post + noise - [shift_m * (step > 40), 0.0, 0.0])
+    is_said = shift_m > 0.0
+    assert estimator.counts['doubled_landmark'] == is_said
+    assert ('added where a known one should be seen' in caplog.text) == is_said
+
+
 def test_a_landmark_that_was_placed_again_has_its_chance_again():
     landmarks = looked_at([4], [39], settled_looks=996, settled_seen=499)
     landmarks.take_for_new(np.array([1]), 0)
@@ -709,7 +727,7 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
 def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved_on():
     """The further the robot goes, the further apart are states that differ in their heading."""
     hypotheses = Hypotheses(State(make_filter(PLANAR, np.eye(4)), PLANAR))
-    hypotheses._all.append(replace(deepcopy(hypotheses._all[0]), cost=1.0))
+    hypotheses._all.append(replace(hypotheses._all[0].copy(), cost=1.0))
     for hypothesis, yaw_rad in zip(hypotheses._all, [0.0, 0.4], strict=True):
         hypothesis.state.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
     velocities, end_ns = VelocityHistory(10**10), 6 * 10**9
@@ -723,7 +741,7 @@ def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved
 def test_settings_and_jumps_of_the_clock_are_of_all_states_that_are_followed():
     settings = LiveSettings.of(Settings())
     hypotheses = Hypotheses(State(make_filter(settings, np.eye(4)), settings))
-    hypotheses._all.append(deepcopy(hypotheses._all[0]))
+    hypotheses._all.append(hypotheses._all[0].copy())
     settings.follow(replace(settings, huber_threshold=3.0))
     assert [hypothesis.state.settings.huber_threshold for hypothesis in hypotheses._all] == [3, 3]
     hypotheses._all = [Mock(), Mock()]
@@ -740,7 +758,7 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     covariances, costs = roots @ roots.swapaxes(1, 2), np.array([0.0, 1.0, 3.0])
     hypotheses = Hypotheses(State(make_filter(settings, np.eye(4)), settings))
     first = hypotheses._all[0]
-    hypotheses._all = [replace(deepcopy(first), cost=cost) for cost in costs.tolist()]
+    hypotheses._all = [replace(first.copy(), cost=cost) for cost in costs.tolist()]
     for hypothesis, pose, covariance in zip(hypotheses._all, poses, covariances, strict=True):
         hypothesis.state.set_pose(pose, covariance)
     weights = np.exp(-costs / 2.0) / np.exp(-costs / 2.0).sum()

@@ -43,11 +43,21 @@ class World:
     observed_every: int = 5  # velocities, at 50 Hz
     settings: Settings = PLANAR
 
-    def drive(self, duration_s, stands_s=(), also=0.0, cargo=NONE, cargo_from_s=0.0, seed=1):
+    def drive(
+        self,
+        duration_s,
+        stands_s=(),
+        also=0.0,
+        made=0.0,
+        cargo=NONE,
+        cargo_s=(0.0, np.inf),
+        seed=1,
+    ):
         """Return events and true poses, by stamp.
 
-        It stands in the windows ``stands_s``, while odometry says that it drives and turns by
-        ``also`` rad/s more. ``cargo`` (m, 3) in its frame, numbered from 100, goes with it.
+        In the windows ``stands_s`` only a share ``made`` of the motion is made, while odometry
+        says that it drives and turns by ``also`` rad/s more. ``cargo`` (m, 3) in its frame,
+        numbered from 100, goes with it from one time to another, when it is put down.
         """
         rng, pose, events, truth = np.random.default_rng(seed), self.start, [], {}
         axes = np.array([1.0, 1.0, 0.0 if self.settings.two_d_mode else 1.0])
@@ -63,13 +73,17 @@ class World:
                 near = np.linalg.norm(points, axis=1) < self.reach_m
                 ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < self.half_view_rad
                 seen = np.flatnonzero(near & ahead)
-                with_it = cargo if time_s >= cargo_from_s else NONE
+                if time_s < cargo_s[1]:
+                    loaded = se3.transform(pose, cargo)
+                with_it = se3.transform(
+                    se3.inverse(pose), loaded if time_s >= cargo_s[0] else NONE
+                )
                 ids = np.append(seen, 100 + np.arange(len(with_it)))
                 exact = np.concatenate([points[seen], with_it])
                 noisy = exact + 0.02 * rng.normal(size=exact.shape) * axes
                 events.append(ObservationEvent(stamp_ns, ids, noisy))
                 truth[stamp_ns] = pose
-            pose = pose if stands else pose @ se3.exp(self.velocity / 50)
+            pose = pose @ se3.exp((made if stands else 1.0) * self.velocity / 50)
         return events, truth
 
     def run(self, drive, in_known_map=False):
@@ -128,6 +142,41 @@ def test_wheels_that_spin_lead_neither_robot_nor_landmarks_astray(name, in_known
     assert off_m[-1] < 0.1
 
 
+@pytest.mark.parametrize('in_known_map', [False, True])
+@pytest.mark.parametrize('name', WORLDS)
+def test_wheels_may_spin_from_the_start(name, in_known_map):
+    world = WORLDS[name]
+    estimator, off_m = world.run(world.drive(8.0, stands_s=[(0.0, 4.0)]), in_known_map)
+    assert estimator.counts['slip'] == 1
+    assert estimator.counts['moved_landmark'] == 0
+    assert off_m.max() < 0.2
+
+
+@pytest.mark.parametrize('speed', [0.1, 0.2, 4.0])
+def test_wheels_spin_slowly_or_fast(speed):
+    world = replace(RING, velocity=speed * RING.velocity)
+    drive = world.drive(4.0 / speed + 4.0, [(2.0 / speed, 2.0 / speed + 3.0)])
+    estimator, off_m = world.run(drive)
+    assert estimator.counts['moved_landmark'] == 0
+    assert off_m.max() < max(0.2, 0.4 * 0.5 * speed)
+    assert off_m[-1] < 0.06
+
+
+def test_it_turns_on_the_spot_by_odometry_alone():
+    world = replace(RING, velocity=np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]))
+    estimator, off_m = world.run(world.drive(16.0, [(8.3, 12.0)]))
+    assert estimator.counts['slip'] == 1
+    assert off_m.max() < 0.06
+
+
+@pytest.mark.parametrize('made', [np.repeat([1.0, 0.0], 3), 0.1, 0.3, 0.5, 0.7], ids=str)
+def test_it_slides_or_slips_in_part(made):
+    estimator, off_m = RING.run(RING.drive(16.0, [(8.0, 12.0)], made=made))
+    assert estimator.counts['moved_landmark'] == 0
+    assert off_m.max() < 0.3
+    assert off_m[-1] < 0.06
+
+
 @pytest.mark.parametrize('also', [0.6, -0.6])
 def test_one_wheel_spins(also):
     estimator, off_m = RING.run(RING.drive(16.0, [(8.0, 12.0)], also))
@@ -149,12 +198,19 @@ def test_each_time_anew(in_known_map):
 @pytest.mark.parametrize('name', WORLDS)
 def test_what_the_robot_carries_is_no_place(name, from_s, caplog):
     world = WORLDS[name]
-    estimator, off_m = world.run(world.drive(16.0, cargo=RACK, cargo_from_s=from_s))
+    estimator, off_m = world.run(world.drive(16.0, cargo=RACK, cargo_s=(from_s, np.inf)))
     assert estimator.counts['carried_landmark'] == len(RACK)
     assert max(estimator.landmark_ids) < 100
     assert estimator.counts['slip'] == 0
     assert off_m[-1] < 0.15
     assert 'landmarks 100, 101, 102 move with the robot' in caplog.text
+
+
+def test_what_it_has_put_down_is_a_place_again():
+    estimator, off_m = RING.run(RING.drive(20.0, cargo=RACK, cargo_s=(0.0, 8.0)))
+    assert estimator.counts['carried_landmark'] == len(RACK)
+    assert {100, 101} <= set(estimator.landmark_ids)
+    assert off_m[-1] < 0.1
 
 
 def test_a_rack_is_carried_while_the_wheels_spin():

@@ -30,7 +30,7 @@ REPORT_KEYS = {
     'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',
     'unsmoothed_ate_rmse_m', 'smoothed_slips', 'motion_factors',
     'localised_after_s', 'unaligned_rmse_m', 'used', 'velocity_topic', 'landmarks_topic',
-    'imu_topic', 'gains', 'truth_covered', 'configuration_anees',
+    'imu_topic', 'gains', 'truth_covered', 'configuration_anees', 'map',
 }  # fmt: skip
 
 
@@ -162,7 +162,7 @@ class TestReport:
         report = slam_observer('replay', path, '--json').json
         unknown = {key for key, value in report.items() if value is None}
         assert unknown == {key for key in REPORT_KEYS if 'rmse' in key} | {
-            'anees', 'localised_after_s', 'truth_covered', 'imu_topic',
+            'anees', 'localised_after_s', 'truth_covered', 'imu_topic', 'map',
             'configuration_anees', 'smoothed_slips',
         }  # fmt: skip
         assert 'no truth to compare with' in slam_observer('replay', path).output
@@ -170,7 +170,7 @@ class TestReport:
     def test_with_a_truth_all_that_can_be_known_is_reported(self, slam_observer, simulated):
         report = slam_observer.succeed('replay', simulated, '--smooth', '--json').json
         unknown = {key for key, value in report.items() if value is None}
-        assert unknown == {'localised_after_s', 'imu_topic', 'unaligned_rmse_m'}
+        assert unknown == {'localised_after_s', 'imu_topic', 'unaligned_rmse_m', 'map'}
         assert report['configuration_anees'] > 0.0
         assert report['truth_covered'] == pytest.approx(1.0)
 

@@ -170,6 +170,29 @@ def test_a_map_that_cannot_be_read_is_refused_before_anything_is_done(slam_obser
     assert f"can't read map {missing}: No such file or directory" in error
 
 
+def test_of_a_folder_of_maps_it_is_said_in_which_the_robot_was_found(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1, has_ids=False)
+    halls = tmp_path / 'halls'
+    halls.mkdir()
+    arguments = ('replay', path, '--load-map', halls, *SETTINGS)
+    ended = slam_observer(*arguments)
+    assert ended.code == 2
+    assert 'there is no map, a file *.yaml, in the folder' in ended.errors
+    other = np.random.default_rng(7).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
+    for name, points in (('east', other), ('west', LANDMARKS)):
+        known = LandmarkMap(np.arange(50), points, None, np.zeros(50, dtype=np.int64))
+        write_map(halls / f'{name}.yaml', known, None)
+    assert slam_observer.succeed(*arguments, '--json').json['map'] == 'west'
+    assert 'found in west after' in slam_observer(*arguments).output
+    ended = slam_observer(*arguments, '--tum', halls / 'east.yaml', '--force')
+    assert ended.code == 2
+    assert 'the file of --load-map' in ended.errors
+    write_map(halls / 'west.yaml', LandmarkMap(np.arange(50), other, None, known.counts), None)
+    ended = slam_observer(*arguments)
+    assert ended.code == 2
+    assert 'was not found: what was seen fits no place in the 2 maps yet' in ended.errors
+
+
 class TestPoseInMapNotKnown:
     """In a map of the landmarks, which have other ids some of the time."""
 

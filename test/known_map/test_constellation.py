@@ -195,11 +195,10 @@ def test_ids_narrow_the_search_but_a_wrong_one_is_not_believed():
     assert place.rows[2] == -1
 
 
-def test_what_would_take_too_long_is_not_decided(monkeypatch):
+def test_what_would_take_too_long_is_not_decided():
     hall = Hall(PLANAR, 5, 300)
     points, _ = hall.see(hall.anywhere(), 8, false=3)
-    monkeypatch.setattr(constellation, 'MAX_LOOKS', 100)
-    places = hall.find(points)
+    places = find_places(hall.known, points, Anywhere(hall.known), ERROR_PROBABILITY, looks=100)
     assert not places.is_complete
     assert places.decided(ERROR_PROBABILITY) is None
 

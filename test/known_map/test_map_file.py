@@ -16,7 +16,7 @@ from slam_observer_ros import __version__
 from slam_observer_ros.common.errors import MapError, SlamObserverError
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import check_writable, read_map, write_map
+from slam_observer_ros.known_map.map_file import check_writable, read_map, read_maps, write_map
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SURVEYED = """\
@@ -174,6 +174,21 @@ def test_a_folder_that_is_missing_is_named(tmp_path):
         write_map(path, a_map(), Settings())
     with pytest.raises(MapError, match=f"can't read map {path}: No such file or directory"):
         read_map(path)
+
+
+def test_a_folder_has_the_maps_of_several_halls(tmp_path):
+    for name, count in (('hall_b.yaml', 4), ('hall_a.yml', 3)):
+        write_map(tmp_path / name, a_map(count), Settings())
+    (tmp_path / 'notes.txt').write_text('no map')
+    maps = read_maps(tmp_path)
+    assert [(known.name, len(known.ids)) for known in maps] == [('hall_a', 3), ('hall_b', 4)]
+    assert [known.name for known in read_maps(tmp_path / 'hall_b.yaml')] == ['hall_b']
+    (tmp_path / 'grid.yaml').write_text('image: hall.pgm\nresolution: 0.05\n')
+    with pytest.raises(MapError, match=r'map .*grid\.yaml: it is an occupancy grid'):
+        read_maps(tmp_path)
+    (tmp_path / 'empty').mkdir()
+    with pytest.raises(MapError, match=r'there is no map, a file \*\.yaml, in the folder .*empty'):
+        read_maps(tmp_path / 'empty')
 
 
 def changed(old, new):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 import logging
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.stats import chi2
 
+from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -479,7 +479,7 @@ def test_once_the_robot_is_placed_no_other_state_is_followed(is_given):
     world = World(3)
     estimator = add(Estimator(world.settings()), [world.see(0.0, world.near(0.0, 8))])
     hypotheses = estimator._hypotheses
-    hypotheses._all.append(deepcopy(hypotheses._all[0]))
+    hypotheses._all.append(hypotheses._all[0].copy())
     if is_given:
         estimator.set_pose(world.start)
     else:
@@ -1150,3 +1150,97 @@ class TestWithoutIds:
         assert len(estimator.landmark_ids) > len(near)
         assert estimator.counts['lost'] == 0
         assert np.linalg.norm(world.error(estimator, 29.9)) < 0.3
+
+
+class TestSeveralMaps:
+    """Which of these halls is it? Each map is in coordinates of its own."""
+
+    @staticmethod
+    def halls(is_planar=True, ids=lambda hall: 0):
+        """Three worlds, and their maps; ``ids`` are added to those of each."""
+        worlds = [World(seed, is_planar) for seed in (20, 21, 22)]
+        maps = [
+            replace(world.map(sigma_m=0.01), ids=np.arange(50) + ids(i), name=f'hall_{i}')
+            for i, world in enumerate(worlds)
+        ]
+        return worlds, maps
+
+    @pytest.mark.parametrize('mode', MODES)
+    @pytest.mark.parametrize('is_planar', [False, True])
+    def test_the_robot_is_found_in_that_where_it_is(self, mode, is_planar, caplog):
+        worlds, maps = self.halls(is_planar)
+        for i, world in enumerate(worlds):
+            estimator = Estimator(world.settings(localization_mode=mode))
+            estimator.load_map(maps)
+            with caplog.at_level(logging.INFO):
+                for event in world.drive(0.0, 3.0, count=8):
+                    estimator.add(without_ids(event))
+            assert estimator.is_localised
+            assert estimator.map_name == f'hall_{i}'
+            assert np.linalg.norm(world.error(estimator, 2.9)) < 0.3
+            assert f'Found the pose in the map hall_{i} by' in caplog.text
+
+    @pytest.mark.parametrize('step', [0, 100])
+    def test_ids_are_used_whether_or_not_halls_have_the_same_ones(self, step):
+        worlds, maps = self.halls(ids=lambda hall: step * hall)
+        world = worlds[1]
+        estimator = Estimator(world.settings())
+        estimator.load_map(maps)
+        assert not estimator.is_localised
+        for event in world.drive(0.0, 3.0, count=4):
+            if isinstance(event, ObservationEvent):
+                event = replace(event, ids=event.ids + step)
+            estimator.add(event)
+        assert estimator.map_name == 'hall_1'
+        assert np.linalg.norm(world.error(estimator, 2.9)) < 0.2
+
+    def test_halls_that_look_the_same_are_named_and_a_rough_pose_does_not_decide(self):
+        worlds, maps = self.halls()
+        alike = [maps[0], replace(maps[0], name='its_twin'), maps[1]]
+        estimator = Estimator(worlds[0].settings())
+        estimator.load_map(alike)
+        add(estimator, [without_ids(event) for event in worlds[0].drive(0.0, 2.0, count=8)])
+        assert not estimator.is_localised
+        problem = estimator.localisation_problem
+        for text in ('2 places in the 3 maps', 'rad) in hall_0 and (', 'rad) in its_twin:'):
+            assert text in problem
+        assert len(estimator.possible_poses) == 2
+
+    def test_a_pose_that_is_given_says_where_in_each_to_look(self):
+        """In halls that are surveyed in one frame it says which one it is."""
+        worlds, (known, *_) = self.halls()
+        east = np.array([100.0, 0.0, 0.0])
+        beside = replace(known, world_points=known.world_points + east, name='east')
+        estimator = Estimator(worlds[0].settings())
+        estimator.load_map([known, beside])
+        there = worlds[0].start.copy()
+        there[:3, 3] += east + [0.4, -0.3, 0.0]
+        estimator.set_pose(there)
+        assert not estimator.is_localised
+        add(estimator, [without_ids(event) for event in worlds[0].drive(0.0, 2.0, count=8)])
+        assert estimator.map_name == 'east'
+        assert abs(estimator.pose[0, 3] - worlds[0].pose(1.9)[0, 3] - 100.0) < 0.1
+
+    def test_a_robot_carried_from_one_hall_to_another_is_found_there(self):
+        worlds, maps = self.halls()
+        estimator = Estimator(worlds[0].settings(localization_mode='uncertain'))
+        estimator.load_map(maps)
+        add(estimator, [without_ids(event) for event in worlds[0].drive(0.0, 5.0, count=8)])
+        assert estimator.map_name == 'hall_0'
+        add(estimator, [without_ids(event) for event in worlds[2].drive(5.0, 12.0, count=8)])
+        assert estimator.counts['lost'] >= 1
+        assert estimator.map_name == 'hall_2'
+        assert np.linalg.norm(worlds[2].error(estimator, 11.9)) < 0.3
+
+    def test_what_can_not_be_several_maps_is_refused(self):
+        _, maps = self.halls()
+        estimator = Estimator(Settings())
+        nothing = maps[0].select(np.zeros(0, dtype=np.int64))
+        for wrong, why in (
+            ([maps[0], replace(maps[1], frame_id='other')], "in frames 'map' and 'other'"),
+            ([], 'there is none'),
+            ([maps[0], nothing], 'is empty'),
+        ):
+            with pytest.raises(MapError, match=why):
+                estimator.load_map(wrong)
+        assert estimator.is_localised

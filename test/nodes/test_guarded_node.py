@@ -37,7 +37,7 @@ def fail(*_):
 def break_filter(self, message):
     broken = self._estimator._hypotheses.best.filter
     if message.data == 1:
-        broken.observer.A = np.full((4, 4), np.nan)
+        broken.observer.A[...] = np.nan
     else:
         broken.joint.P = np.full_like(broken.joint.P, np.nan)
 

@@ -22,6 +22,7 @@ from tf2_msgs.msg import TFMessage
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes.intake.transforms import LiveTransforms
@@ -209,14 +210,15 @@ def _values(diagnostics):
 
 def test_the_nodes_own_transform_takes_no_other_ones_place():
     node = Mock()
-    transforms = LiveTransforms(node, ('map', 'base_link'))
+    buffer = TransformBuffer()
+    LiveTransforms(node, buffer, ('map', 'base_link'))
     receive = node.create_subscription.call_args_list[0].args[2]
     for parent in ('odom', 'map'):
         header = MESSAGES.header(SECOND, parent)
         transform = TransformStamped(header=header, child_frame_id='base_link')
         receive(serialize_message(TFMessage(transforms=[transform])))
-    assert transforms.buffer.newest_ns('odom', 'base_link') == SECOND
-    assert transforms.buffer.newest_ns('map', 'base_link') is None
+    assert buffer.newest_ns('odom', 'base_link') == SECOND
+    assert buffer.newest_ns('map', 'base_link') is None
 
 
 def test_a_second_localisation_on_tf_is_named(ros, tmp_path):

@@ -240,6 +240,29 @@ def test_a_map_that_can_not_be_saved_at_the_end_shows_in_the_exit_code(ros, robo
     assert 'Traceback' not in node.output
 
 
+def test_in_which_hall_of_a_folder_of_maps_the_robot_is_shows(ros, robot, tmp_path):
+    halls = tmp_path / 'halls'
+    halls.mkdir()
+    robot.surveyed_file(halls / 'here.yaml')
+    own, robot.points = robot.points, robot.points[::-1] * [1.0, -1.0, 1.0]
+    robot.surveyed_file(halls / 'there.yaml')
+    robot.points = own
+    pose = se3.exp(np.array([0.0, 0.0, 0.7, 1.0, 2.0, 0.0]))
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    with running('observer_node', tmp_path / 'log', map_file=halls, **PARAMETERS) as node:
+        node.wait_for_output(r'loaded 100 landmarks in 2 maps \(here, there\) from .*halls')
+        robot.connect()
+        estimate, _ = robot.see_until_published(pose, range(8))
+        assert_allclose(estimate, pose, atol=0.1)
+        node.wait_for_output('Found the pose in the map here by 8 of 8 landmarks')
+
+        def map_name():
+            values = diagnostics[-1].status[1].values if diagnostics else ()
+            return {entry.key: entry.value for entry in values}.get('map')
+
+        ros.spin_until(lambda: map_name() == 'here', 'the name of the map')
+
+
 def test_a_map_loaded_while_running_moves_the_estimate_into_its_frame(ros, robot, tmp_path):
     surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(10))
     pose = se3.exp(np.array([0.0, 0.0, 0.7, 1.0, 2.0, 0.0]))

@@ -149,7 +149,8 @@ def test_compressed_covariance_is_the_dense_one(settings, rng):
 def test_copies_share_what_is_large_and_change_apart(rng):
     filters, world = pair(PLAIN), World(rng, PLAIN)
     world.drive(filters, 40)
-    others, other_world = deepcopy((filters, world))
+    others = compressed, dense = tuple(filter_.copy() for filter_ in filters)
+    dense.compressed, other_world = compressed, deepcopy(world)
     before = covariance_of_all(filters[0])
     other_world.drive(others, 50)
     np.testing.assert_array_equal(covariance_of_all(filters[0]), before)

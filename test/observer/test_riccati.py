@@ -25,9 +25,12 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.riccati import riccati as riccati_module
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
+
+CALIBRATED = replace(PLAIN, angular_bias_stddev=(0.02,) * 3, linear_scale_stddev=(0.1,) * 3)
 
 
 def started(rng, settings=PLAIN, n=4):
@@ -70,7 +73,7 @@ def residual_after(truth, x):
     error = slam_group.exp(x[:6], x[6:].reshape(n, 3))
     estimate = Observer(np.eye(4))
     estimate.add_reference_landmarks(se3.rotate(error.A, truth.points) + error.a)
-    estimate.A = error.A @ truth.A
+    estimate.A[...] = error.A @ truth.A
     return estimate.errors(slice(None), truth.body_points(np.arange(n)))[1].ravel()
 
 
@@ -111,7 +114,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     V = rng.normal(size=(pieces, 6))
     Q = random_covariances(rng, pieces, 6)
     riccati = RiccatiFilter(PLAIN, np.eye(4))
-    riccati.observer.A = start = se3.exp(rng.normal(size=6))
+    riccati.observer.A[...] = start = se3.exp(rng.normal(size=6))
     propagate(riccati, V, np.full(pieces, dt_s), Q)
 
     def error(piece, w):
@@ -443,3 +446,42 @@ def test_what_relinearising_failed_for_is_relinearised_later(monkeypatch):
     settings = Settings(relinearization_interval=20, relinearization_angle=0.0)
     estimate(drive(settings, 30.0), settings)
     assert relinearised.keyframes[:4] == [20, 40, 60, 20]
+
+
+@pytest.mark.parametrize('is_exact', [False, True])
+@pytest.mark.parametrize('settings', [CALIBRATED, replace(CALIBRATED, two_d_mode=True)])
+@given(generators())
+def test_many_points_in_blocks_leave_what_all_at_once_would(settings, is_exact, rng):
+    filters = [started(np.random.default_rng(0), settings, n=12) for _ in range(2)]
+    points = filters[0].points + 0.1 * rng.standard_normal((12, 3))
+    if is_exact:
+        for each in filters:
+            each.fix_landmarks(points, np.zeros((12, 3, 3)))
+    rows = rng.permutation(12)
+    seen = filters[0].expected_points(rows) + 0.1 * rng.standard_normal((12, 3))
+    R, all_at_once = 0.01 * random_covariances(rng, 12, 3), riccati_module.AT_ONCE
+    for each, at_once in zip(filters, (all_at_once, 5), strict=True):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(riccati_module, 'AT_ONCE', at_once)
+            observe(each, rows, seen, R)
+    one, other = filters
+    np.testing.assert_allclose(other.observer.A, one.observer.A, rtol=0.0, atol=3e-14)
+    np.testing.assert_allclose(other.points, one.points, rtol=0.0, atol=3e-14)
+    np.testing.assert_allclose(other.calibration.values, one.calibration.values, atol=3e-14)
+    P = one.joint.P
+    np.testing.assert_allclose(other.joint.P, P, rtol=0.0, atol=3e-14 * np.abs(P).max())
+
+
+@given(generators())
+def test_an_outlier_in_a_later_block_is_judged_by_those_before_it(rng):
+    """As the earlier ones have told where the robot is, it stands out."""
+    settings = replace(PLAIN, rejection_threshold=5.0)
+    riccati = started(np.random.default_rng(0), settings, n=12)
+    riccati.set_pose(riccati.observer.A, np.eye(6))
+    rows = np.arange(12)
+    seen = riccati.expected_points(rows) + 0.01 * rng.standard_normal((12, 3))
+    seen[11] += 1.5
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(riccati_module, 'AT_ONCE', 6)
+        weights = observe(riccati, rows, seen, np.tile(1e-4 * np.eye(3), (12, 1, 1)))
+    np.testing.assert_array_equal(weights > 0.0, rows < 11)

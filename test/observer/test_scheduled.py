@@ -119,7 +119,7 @@ def test_an_observation_acts_on_all_landmarks_as_in_a_kalman_filter(rng, n):
     scheduled = landmarks_about_a_robot(rng, n)
     seen = np.sort(rng.permutation(n)[: rng.integers(1, n)])
     bring_up_to_date(scheduled)
-    prior, points, A = covariance_of_all(scheduled), scheduled.points, scheduled.observer.A
+    prior, points, A = covariance_of_all(scheduled), scheduled.points, scheduled.observer.A.copy()
     R = 1e-3 * random_covariances(rng, len(seen), 3)
     residuals = residuals_of(scheduled, seen, scheduled.expected_points(seen) + 0.03, R)
     C = np.zeros((3 * len(seen), len(prior)))

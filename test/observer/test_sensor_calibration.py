@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 import math
 
@@ -100,7 +99,7 @@ def test_derivatives_of_residuals_are_those_of_differences(settings):
     calibration, h = state.filter.calibration, 1e-6
 
     def residuals(change):
-        state_off = deepcopy(state)
+        state_off = state.copy()
         state_off.filter.calibration.shift(change)
         return match(state_off, event).residuals
 

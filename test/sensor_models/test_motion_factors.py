@@ -1,6 +1,5 @@
 """The noise of the odometry over what is stated is found while driving, and made up for."""
 
-from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 import math
@@ -146,7 +145,7 @@ def test_of_what_motion_nothing_can_be_learnt(velocity, dt_s, is_slip):
 def test_every_hypothesis_has_its_own_and_a_reset_forgets_them():
     estimator = estimate(drive(RIGHT, 5.0), RIGHT)
     factors = estimator._state.motion_noise.factors
-    copied = deepcopy(estimator._state).motion_noise.factors
+    copied = estimator._state.copy().motion_noise.factors
     assert copied.estimates == factors.estimates
     copied.move(np.array([np.eye(3)] * 2))
     copied.learn(np.ones((1, 2)), np.eye(2), np.eye(3)[None, :2])

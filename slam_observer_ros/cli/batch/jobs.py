@@ -20,6 +20,7 @@ from slam_observer_ros.cli.replay.input_options import topic_names
 from slam_observer_ros.common.errors import shown, UsageError
 from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.known_map.map_file import map_files
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names, suggestion, table, Value
@@ -131,14 +132,15 @@ def make_job(
     args: argparse.Namespace, recording: Path, sha256: str, point: Point, asked: Asked
 ) -> Job:
     """Return the job of one recording at one point."""
-    map_bytes = None if args.load_map is None else not_special(args.load_map).read_bytes()
+    maps = [] if args.load_map is None else map_files(args.load_map)
+    map_bytes = b''.join(not_special(path).read_bytes() for path in maps)
     depends_on = {
         'recording': sha256,
         'version': VERSION,
         'settings': _changed(asked.settings),
         'inputs': _changed(asked.inputs),
         'topics': dataclasses.astuple(topic_names(args)),
-        'map': None if map_bytes is None else _sha256_of_bytes(map_bytes),
+        'map': _sha256_of_bytes(map_bytes) if maps else None,
         'smooth': args.smooth,
     }
     run_id = _sha256_of_bytes(json.dumps(depends_on, sort_keys=True).encode())[:_ID_DIGITS]

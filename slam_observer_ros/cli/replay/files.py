@@ -20,7 +20,7 @@ from slam_observer_ros.cli.replay.outcome import ReplayOutcome
 from slam_observer_ros.cli.replay.rerun import check_rerun, VIEWER
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.evaluation.trajectory import write_tum
-from slam_observer_ros.known_map.map_file import write_map
+from slam_observer_ros.known_map.map_file import map_files, write_map
 from slam_observer_ros.recording.opening import files_of
 
 logger = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ def check_files(args: argparse.Namespace) -> None:
     read = {f'the recording {args.recording}': files_of(args.recording)}
     if args.config is not None:
         read['the file of --config'] = [find_config(args.config)]
-    loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
+    loaded = {} if args.load_map is None else {'the file of --load-map': map_files(args.load_map)}
     files = {
         '--tum': args.tum,
         '--report': args.report,

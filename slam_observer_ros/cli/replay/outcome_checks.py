@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Sequence
 import logging
 from pathlib import Path
 
@@ -112,7 +113,7 @@ def _warn_of_unused_velocities(
         )
 
 
-def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap) -> None:
+def check_localised(args: argparse.Namespace, result: Replay, maps: Sequence[LandmarkMap]) -> None:
     """Refuse an outcome that is not in the frame of the map that was loaded.
 
     Where the pose in it was found and lost again the trajectory is still of use, but not the map:
@@ -121,7 +122,7 @@ def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap
     if result.estimator.is_localised:
         return
     if result.localised_ns is None:
-        raise UsageError(_never_found(args.load_map, result, known))
+        raise UsageError(_never_found(args.load_map, result, maps))
     end_s = result.seconds_until(result.localised_ns[1])
     lost = f'the pose in the map {args.load_map} was lost after {end_s:.1f} s, and not found again'
     if args.map is not None or args.smooth:
@@ -129,8 +130,9 @@ def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap
     logger.warning('%s; the trajectory ends there.', lost[0].upper() + lost[1:])
 
 
-def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
-    named = known.ids[~is_automatic(known.ids)]
+def _never_found(path: Path, result: Replay, maps: Sequence[LandmarkMap]) -> str:
+    ids = np.concatenate([known.ids for known in maps])
+    named = ids[~is_automatic(ids)]
     least = 'two' if result.estimator.settings.two_d_mode else 'three'
     if is_automatic(result.estimator.landmark_ids).any():
         return (
@@ -140,7 +142,7 @@ def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
     return (
         f'the pose in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
-        f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(known.ids)} were '
+        f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(ids)} were '
         f'seen{_advice(result)}'
     )
 

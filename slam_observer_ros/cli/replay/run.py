@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 import logging
 
@@ -24,7 +25,7 @@ from slam_observer_ros.cli.replay.outcome_checks import (
 )
 from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.known_map.map_file import read_maps
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -41,9 +42,9 @@ def replayed(
 ) -> tuple[ReplayOutcome, str]:
     """Replay ``args.recording``; return what came of it, and the frame of outputs."""
     warn_of_unused(args, asked.settings)
-    landmark_map = None if args.load_map is None else read_map(args.load_map)
-    outcome = _replay(args, asked.settings, asked.inputs, landmark_map, shows_progress)
-    return outcome, _frame_of_outputs(asked.inputs, landmark_map)
+    maps = [] if args.load_map is None else read_maps(args.load_map)
+    outcome = _replay(args, asked.settings, asked.inputs, maps, shows_progress)
+    return outcome, _frame_of_outputs(asked.inputs, maps)
 
 
 def select_inputs(
@@ -63,7 +64,7 @@ def _replay(
     args: argparse.Namespace,
     settings: Settings,
     inputs: InputSettings,
-    landmark_map: LandmarkMap | None,
+    maps: Sequence[LandmarkMap],
     shows_progress: bool,
 ) -> ReplayOutcome:
     """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
@@ -73,15 +74,15 @@ def _replay(
         if shows_progress:
             events = show_progress(events, 'replaying', recording.event_count(selected))
         recorder = _recorder(args)
-        map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
+        map_frame = maps[0].frame_id if maps else inputs.map_frame
         needs_poses = args.tum is not None or _is_shown(args) or len(truth.stamps_ns) > 0
         with estimate_writer(args, recording, selected, inputs, map_frame) as writer:
             recorders = [noter for noter in (recorder, writer) if noter is not None]
-            result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
+            result = replay(events, settings, truth, maps or None, needs_poses, recorders)
             warn_of_resets(result)
             check_used(args, recording, selected, inputs, result)
-            if landmark_map is not None:
-                check_localised(args, result, landmark_map)
+            if maps:
+                check_localised(args, result, maps)
             outcome = outcome_of(recording, selected, result, truth)
             if writer is not None:
                 writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
@@ -103,14 +104,14 @@ def _is_shown(args: argparse.Namespace) -> bool:
     return any(output is not None for output in (args.report, args.plot, args.rerun))
 
 
-def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
+def _frame_of_outputs(inputs: InputSettings, maps: Sequence[LandmarkMap]) -> str:
     """Return the frame of what is written: that of the map that was loaded, if one was."""
-    if landmark_map is None or landmark_map.frame_id == inputs.map_frame:
+    if not maps or maps[0].frame_id == inputs.map_frame:
         return inputs.map_frame
     logger.warning(
         "The map is in frame '%s', and so is what is written; the node takes it with "
         'map_frame: %s only.',
-        landmark_map.frame_id,
-        landmark_map.frame_id,
+        maps[0].frame_id,
+        maps[0].frame_id,
     )
-    return landmark_map.frame_id
+    return maps[0].frame_id

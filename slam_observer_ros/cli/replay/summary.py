@@ -18,7 +18,7 @@ from slam_observer_ros.runs.replay import Replay
 NEARLY_ALL = 0.99
 """Share of the trajectory that the truth covers, up to which it is printed."""
 
-LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported')
+LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported', 'doubled')
 """What may happen to landmarks of the map; counted under these names."""
 
 
@@ -41,6 +41,7 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'used': dict(estimator.counts),
         'calibration': {part.name: asdict(part) for part in estimator.calibration},
         'motion_factors': {part.name: asdict(part) for part in estimator.motion_factors},
+        'map': estimator.map_name or None,
         'localised_after_s': outcome.localised_after_s,
         'truth_covered': outcome.truth_covered,
         'ate_rmse_m': _ate_rmse_m(errors),
@@ -112,9 +113,10 @@ def _loss_text(outcome: ReplayOutcome) -> str:
 
 
 def _localisation_text(result: Replay, localised_after_s: float) -> str:
-    found = f'found after {localised_after_s:.1f} s, where the trajectory begins'
-    if result.estimator.settings.set_initial_pose:
-        found = 'given at the start'
+    name = f' in {result.estimator.map_name}' if result.estimator.map_name else ''
+    found = f'found{name} after {localised_after_s:.1f} s, where the trajectory begins'
+    if result.estimator.settings.set_initial_pose and localised_after_s == 0.0:
+        found = f'given{name} at the start'
     lost = result.estimator.counts['lost']
     return f'{found}; lost {lost} × and searched again' if lost else found
 

@@ -90,7 +90,7 @@ def _way_from_others(point: FloatArray, markers: FloatArray, near: float) -> Flo
 def _hits_label(
     candidates: FloatArray, half: FloatArray, middles: FloatArray, halves: FloatArray
 ) -> BoolArray:
-    """Return at which candidates (k, 2) a label would hit one of those that were written."""
+    """Return at which candidates (k, 2) a label would hit one that is written."""
     apart = np.abs(candidates[:, None] - middles)
     return np.asarray(np.any(np.all(apart < half + halves, axis=-1), axis=-1))
 

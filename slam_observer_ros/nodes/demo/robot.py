@@ -63,7 +63,7 @@ class Observer:
         if keeps_pose:
             more += ['-p', f'pose_file:={folder / "pose.yaml"}']
         self._command = [
-            *(sys.executable, '-m', f'slam_observer_ros.nodes.{EXECUTABLE}'),
+            *(sys.executable, '-m', 'slam_observer_ros.nodes.executables', EXECUTABLE),
             *command_line(PARAMS_FILE, arguments),
             *more,
         ]

@@ -50,14 +50,21 @@ MAX_SENSORS = 100
 class EstimatorFeed:
     """Gives what comes in to the estimator, in the base frame and in this machine's time.
 
-    Attributes
+    Parameters
     ----------
-    dropped : Counter
-        Messages that did not become events, by reason.
+    node : Node
+    settings : ObserverNodeSettings
+    estimator : Estimator
+    base_frame : BaseFrame
     on_events : callable
         Called after events were used, with the name of the input that gave them; '' for several.
     on_waiting : callable
         Called when something begins to wait: :meth:`retry` is to be called often from then on.
+
+    Attributes
+    ----------
+    dropped : Counter
+        Messages that did not become events, by reason.
     clocks : dict of str to ClockOffset
         How far off the stamps are, by input.
     is_active : bool
@@ -73,6 +80,8 @@ class EstimatorFeed:
         settings: ObserverNodeSettings,
         estimator: Estimator,
         base_frame: BaseFrame,
+        on_events: Callable[[str], None],
+        on_waiting: Callable[[], None],
     ) -> None:
         self._node = node
         self._settings = settings
@@ -99,8 +108,7 @@ class EstimatorFeed:
             self._topics['landmarks'] = f"'{node.resolve_topic_name('/tf')}'"
         self.is_active = False
         self.is_paused = False
-        self.on_events: Callable[[str], None] = lambda _name: None
-        self.on_waiting: Callable[[], None] = lambda: None
+        self.on_events, self._on_waiting = on_events, on_waiting
 
     @property
     def is_waiting(self) -> bool:
@@ -112,7 +120,7 @@ class EstimatorFeed:
         if not (self.is_active and self._is_of_another_run(name, measured, receive_ns)):
             self._use(name, measured, receive_ns)
         if self.is_waiting:
-            self.on_waiting()
+            self._on_waiting()
 
     def begin_clock_jump(self, back_ns: int) -> None:
         """Use only what is of the time before /clock has jumped back, nanoseconds, until the end.

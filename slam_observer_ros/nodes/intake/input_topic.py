@@ -88,7 +88,7 @@ class InputTopic(Generic[MessageT]):
     topic : str
         Topic name after remapping.
     received, malformed : int
-        Messages so far, and those that could not be decoded.
+        Messages so far, and how many could not be decoded.
     shedding : LoadShedding
         What is dropped, and how much was, as they come faster than they can be used.
     advice : mapping of str to str
@@ -98,7 +98,7 @@ class InputTopic(Generic[MessageT]):
     is_shared : bool
         Whether several may publish on it, as several sensors of landmarks.
     read_first : sequence of InputTopic
-        Other inputs, of which what was received before a message of this one is read before it.
+        Other inputs: what they received before a message of this one is read before it.
         An executor reads one message of each topic in turn, so after the node was busy a slow
         topic would run far ahead of a fast one. It still does where the middleware does not
         report when it has received a message.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -23,34 +23,43 @@ TF_QOS = QoSProfile(depth=100)
 TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+class SentTransforms(Protocol):
+    """What is published on /tf from here."""
+
+    def is_own(self, raw: bytes) -> bool:
+        """Return whether a message heard on /tf came from here; then it is not looked into."""
+
+    def hear(self, parent: str, child: str, stamp_ns: int) -> None:
+        """Take what was heard from others."""
+
+
 class LiveTransforms:
     """Listens to /tf and /tf_static; without tf2_msgs no transform is ever known.
 
     Parameters
     ----------
     node : Node
+    buffer : TransformBuffer
+        Takes what is heard.
     own : (str, str)
         Parent and child of the transform that the node itself publishes where nobody else gives
         the child a parent: heard back, it would replace another parent.
-
-    Attributes
-    ----------
-    buffer : TransformBuffer
-        What is known.
-    on_transform : callable
-        Called with parent, child and stamp, nanoseconds, of each transform on /tf.
-    is_own : callable
-        Says of a message on /tf whether it came from here; then it is not looked into.
+    sent : SentTransforms, optional
+        What is published from here; None if nothing is.
 
     """
 
-    def __init__(self, node: Node, own: tuple[str, str]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        buffer: TransformBuffer,
+        own: tuple[str, str],
+        sent: SentTransforms | None = None,
+    ) -> None:
         self._node = node
-        self._own = own
+        self._buffer = buffer
+        self._own, self._sent = own, sent
         self._log = ThrottledLog(node)
-        self.on_transform: Callable[[str, str, int], None] = _ignore
-        self.is_own: Callable[[bytes], bool] = _is_of_another
-        self.buffer = TransformBuffer()
         self._dynamic: Subscription | None = None
         if TFMessage is not None:
             self._dynamic = self._subscribe('/tf', TF_QOS, is_static=False)
@@ -68,29 +77,20 @@ class LiveTransforms:
 
     def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> Subscription:
         def receive(raw: bytes) -> None:
-            if self.is_own(raw):
+            if self._sent is not None and self._sent.is_own(raw):
                 return
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
                 self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
                 return
-            if not is_static:
+            if self._sent is not None and not is_static:
                 for each in transforms:
-                    self.on_transform(each.frame_id, each.child_frame_id, each.stamp_ns)
+                    self._sent.hear(each.frame_id, each.child_frame_id, each.stamp_ns)
             others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
-            insert_transforms(self.buffer, others, is_static=is_static)
+            insert_transforms(self._buffer, others, is_static=is_static)
 
         return self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
-
-
-def _ignore(_parent: str, _child: str, _stamp_ns: int) -> None:
-    """Take no notice of a transform."""
-
-
-def _is_of_another(_raw: bytes) -> bool:
-    """Take each message to be of another publisher."""
-    return False
 
 
 class TransformedOdometry:

@@ -17,13 +17,12 @@ from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
+from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
 from slam_observer_ros.nodes.intake.input_topic import rivals
-from slam_observer_ros.nodes.intake.transforms import LiveTransforms
 from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import (
     LATCHED_POSE_QOS,
@@ -82,7 +81,7 @@ MAX_AHEAD_S = 0.25
 
 
 class EstimatePublisher:
-    """Publishes the estimate on ``TOPICS`` and /tf; ``transforms`` has others' odometry.
+    """Publishes the estimate on ``TOPICS`` and /tf; ``buffer`` has others' odometry.
 
     Each message carries the stamp of the estimator's state, never the present time, and no stamp
     is published twice, unless landmarks were forgotten. Nothing is published while the pose in a
@@ -94,7 +93,7 @@ class EstimatePublisher:
         node: Node,
         settings: ObserverNodeSettings,
         estimator: Estimator,
-        transforms: LiveTransforms,
+        buffer: TransformBuffer,
     ) -> None:
         self._node = node
         self._settings = settings
@@ -114,25 +113,23 @@ class EstimatePublisher:
         self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
         self._map = node.create_publisher(PointCloud2, 'landmark_map', LATCHED_QOS)
         self._markers = node.create_publisher(MarkerArray, 'markers', RELIABLE_QOS)
-        self._broadcaster: PoseBroadcaster | None = None
+        self.broadcaster: PoseBroadcaster | None = None
         if settings.publish_tf:
-            self._broadcaster = PoseBroadcaster(
-                node, settings, transforms.buffer, estimator.settings.reorder_window
+            self.broadcaster = PoseBroadcaster(
+                node, settings, buffer, estimator.settings.reorder_window
             )
-            transforms.on_transform = self._broadcaster.hear
-            transforms.is_own = self._broadcaster.is_own
 
     @property
     def problem(self) -> str:
         """Why the transform is not published as it should be; empty while it is."""
-        if self._broadcaster is None:
+        if self.broadcaster is None:
             return ''
-        return self._broadcaster.problem or self._broadcaster.rival
+        return self.broadcaster.problem or self.broadcaster.rival
 
     @property
     def odometry_age_s(self) -> float | None:
         """Age of the newest odometry on /tf, seconds; None if there is none."""
-        newest_ns = None if self._broadcaster is None else self._broadcaster.odometry_ns()
+        newest_ns = None if self.broadcaster is None else self.broadcaster.odometry_ns()
         if newest_ns in (None, ALWAYS_NS):
             return None
         now_ns: int = self._node.get_clock().now().nanoseconds
@@ -166,13 +163,13 @@ class EstimatePublisher:
     @property
     def is_waiting(self) -> bool:
         """Whether there is something to publish, once it is due or the odometry is there."""
-        is_waiting = self._broadcaster is not None and self._broadcaster.is_waiting
+        is_waiting = self.broadcaster is not None and self.broadcaster.is_waiting
         return is_waiting or self._is_new(self._fast_stamp_ns)
 
     def publish_state(self, source: str = '') -> None:
         """Publish odometry, pose, transform, Lyapunov value and landmarks if new and due."""
-        if self._broadcaster is not None:
-            self._broadcaster.retry()
+        if self.broadcaster is not None:
+            self.broadcaster.retry()
         stamp_ns = self._estimator.stamp_ns
         if stamp_ns is None or not (self._is_new(self._fast_stamp_ns) and self.is_due(source)):
             return
@@ -180,8 +177,8 @@ class EstimatePublisher:
         self._fast_stamp_ns = stamp_ns
         pose = self._estimator.pose
         self._publish_pose(stamp_ns, pose)
-        if self._broadcaster is not None:
-            self._broadcaster.add(stamp_ns, pose)
+        if self.broadcaster is not None:
+            self.broadcaster.add(stamp_ns, pose)
         self._extend_path(stamp_ns, pose)
         # What nobody reads, and nobody can read later, is not made.
         if self._lyapunov.get_subscription_count():
@@ -221,8 +218,8 @@ class EstimatePublisher:
 
     def repeat_transform(self) -> None:
         """Publish the odometry's correction as of now, while no new one comes."""
-        if self._broadcaster is not None:
-            self._broadcaster.repeat(self._node.get_clock().now().nanoseconds)
+        if self.broadcaster is not None:
+            self.broadcaster.repeat(self._node.get_clock().now().nanoseconds)
 
     def reset(self) -> None:
         """Forget the path and what waits: the estimate has another pose, frame or time.
@@ -231,8 +228,8 @@ class EstimatePublisher:
         """
         self._path.clear()
         self._path_stamp_ns = None
-        if self._broadcaster is not None:
-            self._broadcaster.clear()
+        if self.broadcaster is not None:
+            self.broadcaster.clear()
         self.replace_landmarks()
 
     def _is_new(self, published_ns: int | None) -> bool:

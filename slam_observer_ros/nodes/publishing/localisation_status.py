@@ -104,6 +104,7 @@ class LocalisationStatus:
             message = f'{message}; {self._noise.problem}'
         known = ('unknown', 'unknown') if deviations is None else [f'{d:.3f}' for d in deviations]
         values = {
+            'map': self._estimator.map_name or 'none',
             'position, standard deviation [m]': known[0],
             'heading, standard deviation [rad]': known[1],
             'innovations / stated noise': str(self._noise),

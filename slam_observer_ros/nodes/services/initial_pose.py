@@ -59,7 +59,8 @@ class InitialPoseListener:
             return
         self._on_move()
         x, y, z = message.position.tolist()
-        self._node.get_logger().info(f'the robot is set to ({x:.2f}, {y:.2f}, {z:.2f}) m')
+        what = 'is set to' if self._estimator.is_localised else 'is searched for about'
+        self._node.get_logger().info(f'the robot {what} ({x:.2f}, {y:.2f}, {z:.2f}) m')
 
     def _set(self, pose: FloatArray, covariance: FloatArray, stamp_ns: int) -> None:
         """Move the robot to where it was at a stamp, and add how it moved since, as AMCL does."""

@@ -17,7 +17,7 @@ from slam_observer_ros.common.errors import MapError, ParameterError, SlamObserv
 from slam_observer_ros.common.output_files import checked_name
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import check_writable, read_map, write_map
+from slam_observer_ros.known_map.map_file import check_writable, read_maps, write_map
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT_PERIODS = 20.0
@@ -208,17 +208,21 @@ class MapServices:
         return f"saved {what} in frame '{self._map_frame}' to {path}{kept}"
 
     def _load(self, path: Path) -> str:
-        landmark_map = read_map(path)
-        if landmark_map.frame_id != self._map_frame:
-            raise MapError(
-                f"map {path} is in frame '{landmark_map.frame_id}', and 'map_frame' is "
-                f"'{self._map_frame}': make them the same"
-            )
+        maps = read_maps(path)
+        for known in maps:
+            if known.frame_id != self._map_frame:
+                raise MapError(
+                    f"map {known.name} of {path} is in frame '{known.frame_id}', and 'map_frame' "
+                    f"is '{self._map_frame}': make them the same"
+                )
         self._estimator.release()  # what has come before belongs to the old frame
-        self._estimator.load_map(landmark_map)
+        self._estimator.load_map(maps)
         self._own_files.add(path)
         self._on_load()
-        return f'loaded {len(landmark_map.ids)} landmarks from {path}; {self._pose_in_map()}'
+        what = f'{sum(len(known.ids) for known in maps)} landmarks'
+        if len(maps) > 1:
+            what += f' in {len(maps)} maps ({", ".join(known.name for known in maps)})'
+        return f'loaded {what} from {path}; {self._pose_in_map()}'
 
     def _pose_in_map(self) -> str:
         estimator = self._estimator

@@ -11,8 +11,9 @@ there are few landmarks all are active.
 
 from __future__ import annotations
 
-from copy import copy, deepcopy
+from copy import copy
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
@@ -24,7 +25,11 @@ from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance, sheared
 from slam_observer_ros.observer.riccati.outside_landmarks import OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
+from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.motion import Motion
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 REFERENCE_SHIFT_M = 0.1
 """How far estimates of landmarks out of view may be from their references."""
@@ -55,7 +60,7 @@ class CompressedCovariance(JointCovariance):
     def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
         vars(self).update(vars(dense))
         self._form, self._observer, self._size = copy(dense), observer, size
-        self._form.P = self.P[: self.first, : self.first]
+        self._form._matrix = SymmetricMatrix(self.P[: self.first, : self.first])
         n = len(observer.y_ref)
         self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
         self._set_active(np.arange(n), n)
@@ -64,11 +69,11 @@ class CompressedCovariance(JointCovariance):
         self._postponed = PostponedCorrection(self.P, self._axes.point)
         self._unchecked, self._most = 0, size.most
 
-    def __deepcopy__(self, memo: dict[int, object]) -> CompressedCovariance:
+    def copy(self, observer: Observer) -> Self:
         """Return an independent copy, which shares what takes much memory until it changes."""
-        other = copy(self)
-        other.P, other._observer = self.P, deepcopy(self._observer, memo)
-        other._outside, other._postponed = self._outside.copy(), deepcopy(self._postponed, memo)
+        other = super().copy(observer)
+        other._observer = observer
+        other._outside, other._postponed = self._outside.copy(), self._postponed.copy()
         return other
 
     @property
@@ -198,7 +203,10 @@ class CompressedCovariance(JointCovariance):
     def dense(self) -> JointCovariance:
         """Return the same with all landmarks in P, which the observer has moved."""
         self._apply()
-        return self.marginal(np.arange(len(self._places)))
+        joint = self.marginal(np.arange(len(self._places)))
+        self.P = joint.P
+        joint._matrix = self._matrix
+        return joint
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
         """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
@@ -233,7 +241,7 @@ class CompressedCovariance(JointCovariance):
         order = np.argsort(np.append(np.flatnonzero(is_active), others))
         joint = copy(self._form)
         columns = np.append(np.arange(self.first), joint._columns(order))
-        joint.P = P[np.ix_(columns, columns)]
+        joint._matrix = SymmetricMatrix(P[np.ix_(columns, columns)])
         return joint
 
     # Which landmarks are active

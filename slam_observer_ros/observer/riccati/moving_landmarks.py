@@ -12,6 +12,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
@@ -20,9 +21,13 @@ class MovingLandmarksCovariance(JointCovariance):
     """P with columns for velocities, too, at first of ``velocity_error``, m/s."""
 
     def __init__(
-        self, axes: EstimatedAxes, calibration: Calibration, velocity_error: float
+        self,
+        axes: EstimatedAxes,
+        calibration: Calibration,
+        matrix: SymmetricMatrix,
+        velocity_error: float,
     ) -> None:
-        super().__init__(axes, calibration)
+        super().__init__(axes, calibration, matrix)
         self._velocity_error = velocity_error
         self._stride = 2 * axes.point
 

@@ -15,6 +15,8 @@ many corrections D₁ a + T X_i, with a tensor T. See docs/theory.md, Large maps
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from scipy.linalg.lapack import dpstrf
 
@@ -33,6 +35,13 @@ class PostponedCorrection:
         self.shift: FloatArray = np.zeros((point, point, size))
         self.has_moved = False
         self._deviations = np.sqrt(np.maximum(np.diagonal(P), 0.0))
+
+    def copy(self) -> PostponedCorrection:
+        """Return an independent copy."""
+        other = copy(self)
+        other.Phi, other.Psi = self.Phi.copy(), self.Psi.copy()
+        other.shift = self.shift.copy()
+        return other
 
     def correct(self, W: FloatArray, W_Phi: FloatArray, z: FloatArray, turn: FloatArray) -> None:
         """Take in a correction which turned the state by ``turn`` (3,), rad.

@@ -14,7 +14,7 @@ in large maps less: :mod:`.compressed_covariance`.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
@@ -41,6 +41,12 @@ from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+AT_ONCE = 32
+"""Points that are used at once; each block of so many is judged by what those before it left."""
+
 MERGER_ROUNDS = 4
 """How often a merger is linearised; the last times it hardly changes."""
 
@@ -60,12 +66,18 @@ class RiccatiFilter(Filter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        error = settings.landmark_velocity_stddev
+        error, matrix = settings.landmark_velocity_stddev, self.observer.covariance
         self.joint = (
-            MovingLandmarksCovariance(self.axes, self.calibration, error)
+            MovingLandmarksCovariance(self.axes, self.calibration, matrix, error)
             if error > 0.0
-            else JointCovariance(self.axes, self.calibration)
+            else JointCovariance(self.axes, self.calibration, matrix)
         )
+
+    def copy(self) -> Self:
+        """Return an independent copy."""
+        other = super().copy()
+        other.joint = self.joint.copy(other.observer)
+        return other
 
     def propagate(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to P."""
@@ -77,6 +89,24 @@ class RiccatiFilter(Filter):
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
+        m = len(residuals.rows)
+        if m <= AT_ONCE:
+            x, weights = self._correction(residuals)
+            self._move(x)
+            return weights
+        # One block after the other costs less than all at once, and leaves the same. The state
+        # moves only then: all are linearised at the same point.
+        x, weights = np.zeros(len(self.joint.P)), np.empty(m)
+        for start in range(0, m, AT_ONCE):
+            block = residuals.select(slice(start, start + AT_ONCE))
+            change = self.joint.change_of_residuals(block, x)
+            change_of_x, weights[start : start + AT_ONCE] = self._correction(block.changed(change))
+            x += change_of_x
+        self._move(x)
+        return weights
+
+    def _correction(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+        """Update P; return −K r, and the weight (m,) of each point."""
         r, R = residuals.on(self.axes)
         # A gate, then Huber's weights; errors that last make R larger, too.
         predicted = self.predicted(residuals)[1]
@@ -88,8 +118,7 @@ class RiccatiFilter(Filter):
         repeated = repetition_factors(used.dt_s, self._settings.observation_correlation_time)
         R = R * (repeated / weights[passed])[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
-        self._move(self.joint.correct(self.joint.output_matrix(used), used.rows, R, r))
-        return weights
+        return self.joint.correct(self.joint.output_matrix(used), used.rows, R, r), weights
 
     def learn_motion_noise(self, residuals: Residuals) -> None:
         """Let residuals show how noisy the motion was, if something else than them corrects it."""

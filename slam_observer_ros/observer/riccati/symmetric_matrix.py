@@ -6,6 +6,8 @@ one; then the other is its mirror image, to the bit.
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
@@ -22,8 +24,18 @@ class SymmetricMatrix:
     """Values (N, N), and room for some more rows and columns, which is zero."""
 
     def __init__(self, values: FloatArray) -> None:
+        self.set(values)
+
+    def set(self, values: FloatArray) -> None:
+        """Become ``values`` (N, N), of any size."""
         self._storage: FloatArray = np.array(values, order='C')
         self._size = len(values)
+
+    def copy(self) -> SymmetricMatrix:
+        """Return an independent copy."""
+        other = copy(self)
+        other._storage = self._storage.copy()
+        return other
 
     @property
     def values(self) -> FloatArray:

@@ -21,6 +21,7 @@ from slam_observer_ros.observer.riccati.joint_covariance import (
     JointCovariance,
     sheared,
 )
+from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
@@ -28,8 +29,10 @@ from slam_observer_ros.sensor_models.motion import Motion
 class TagCovariance(JointCovariance):
     """P with columns for orientations, too."""
 
-    def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
-        super().__init__(axes, calibration)
+    def __init__(
+        self, axes: EstimatedAxes, calibration: Calibration, matrix: SymmetricMatrix
+    ) -> None:
+        super().__init__(axes, calibration, matrix)
         self._stride = axes.point + axes.turn
 
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray | None]:

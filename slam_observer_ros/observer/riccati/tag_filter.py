@@ -8,6 +8,8 @@ are taken to be independent, so to first order that is the same as both at once.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
@@ -25,6 +27,9 @@ from slam_observer_ros.observer.robust import distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 
 class RiccatiTagFilter(RiccatiFilter):
     """Gains from the full covariance of pose, calibration, landmarks and their orientations."""
@@ -34,9 +39,15 @@ class RiccatiTagFilter(RiccatiFilter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        self.joint = TagCovariance(self.axes, self.calibration)
+        self.joint = TagCovariance(self.axes, self.calibration, self.observer.covariance)
         self.orientations = LandmarkOrientations()
         self._is_exact = False  # the map
+
+    def copy(self) -> Self:
+        """Return an independent copy."""
+        other = super().copy()
+        other.orientations = self.orientations.copy()
+        return other
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Move the state by what is seen of known orientations.
@@ -124,13 +135,13 @@ class RiccatiTagFilter(RiccatiFilter):
     ) -> None:
         """Append landmarks seen for the first time, as yet without orientation."""
         super().add(points, covariances, D)
-        self.orientations.add(len(points))
+        self.orientations.append_zeros(len(points))
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks of a map, with the orientations that it knows."""
         first = len(self.observer.y_ref)
         super().add_known(known)
-        self.orientations.add(len(known))
+        self.orientations.append_zeros(len(known))
         self._take_orientations(first + np.arange(len(known)), known)
 
     def enter_map(self, rows: IntArray, known: KnownLandmarks) -> None:
@@ -183,7 +194,7 @@ class RiccatiTagFilter(RiccatiFilter):
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
         super().remove(rows)
-        self.orientations.remove(rows)
+        self.orientations.delete(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact, and their orientations."""
@@ -192,7 +203,7 @@ class RiccatiTagFilter(RiccatiFilter):
         self.joint = joint
         self._is_exact = True
         self.orientations = LandmarkOrientations()  # until the map says what they are
-        self.orientations.add(len(y_ref))
+        self.orientations.append_zeros(len(y_ref))
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x), and the orientations: B̂_i ← exp(ω_i) B̂_i."""

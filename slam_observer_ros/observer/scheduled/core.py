@@ -11,6 +11,8 @@ Joseph's form. The postponed landmarks, which depend on the core, follow both.
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -48,6 +50,14 @@ class Core:
         self.P: FloatArray = np.zeros((len(start) + self._slots.size,) * 2)
         self.P[: len(start), : len(start)] = start
         self.postponed = PostponedLandmarks(axes, len(self.P))
+
+    def copy(self, calibration: Calibration) -> Core:
+        """Return an independent copy, whose calibration has been copied."""
+        other = copy(self)
+        other._calibration, other._unseen = calibration, self._unseen.copy()
+        other.rows, other.P = self.rows.copy(), self.P.copy()
+        other.postponed = self.postponed.copy()
+        return other
 
     def predict(self, motion: Motion) -> None:
         """Add a motion's noise to the pose, and what the calibration's error adds."""

@@ -16,6 +16,8 @@ log₂ n of them, and a landmark takes part in O(log n) mergers until it is seen
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -45,6 +47,14 @@ class PostponedLandmarks:
 
     def __len__(self) -> int:
         return len(self._F)
+
+    def copy(self) -> PostponedLandmarks:
+        """Return an independent copy."""
+        other = copy(self)
+        other._F, other._N, other._shifts = self._F.copy(), self._N.copy(), self._shifts.copy()
+        other._group, other._sizes = self._group.copy(), self._sizes.copy()
+        other._G, other._V, other._x = self._G.copy(), self._V.copy(), self._x.copy()
+        return other  # lists of members are never changed in place
 
     def add(self, F: FloatArray, N: FloatArray) -> None:
         """Append landmarks (m,) with F (m, k, q) and N (m, k, k), m²."""

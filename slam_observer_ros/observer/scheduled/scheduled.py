@@ -23,6 +23,7 @@ which also has the origin: the compressed EKF and postponement.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -44,6 +45,9 @@ from slam_observer_ros.observer.scheduled.core import Core, regression
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,13 @@ class ScheduledFilter(Filter):
         super().__init__(settings, reference_pose)
         self._core = Core(self.axes, self.calibration)
         self._postponed = self._core.postponed
+
+    def copy(self) -> Self:
+        """Return an independent copy."""
+        other = super().copy()
+        other._core = self._core.copy(other.calibration)
+        other._postponed = other._core.postponed
+        return other
 
     def propagate(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to the core's."""

@@ -1,0 +1,76 @@
+"""Arrays that have a row for each landmark, and grow and shrink together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from typing import Any, ClassVar, TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from slam_observer_ros.common.types import IntArray
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+LEAST_ROOM = 16
+"""Rows for which there is room at first."""
+
+
+class LandmarkColumns:
+    """Arrays of n rows, row i of each being of landmark i, with room for more rows.
+
+    A subclass names them in ``COLUMNS``, with the type and shape of a row. Each is an attribute,
+    a view of its first n rows: it is written to in place, and only taking in and removing
+    landmarks replaces it.
+    """
+
+    COLUMNS: ClassVar[Mapping[str, tuple[DTypeLike, tuple[int, ...]]]]
+
+    def __init__(self) -> None:
+        self._stores: dict[str, NDArray[Any]] = {
+            name: np.zeros((LEAST_ROOM, *shape), dtype)
+            for name, (dtype, shape) in self.COLUMNS.items()
+        }
+        self._show(0)
+
+    def __len__(self) -> int:
+        """Return n."""
+        return self._count
+
+    def copy(self) -> Self:
+        """Return an independent copy: one copy of memory an array."""
+        other = copy(self)
+        other._stores = {name: store.copy() for name, store in self._stores.items()}
+        other._show(self._count)
+        return other
+
+    def __deepcopy__(self, _memo: object) -> Self:
+        """Return :meth:`copy`: copied one by one, the attributes would be views no more."""
+        return self.copy()
+
+    def append_zeros(self, m: int) -> IntArray:
+        """Append rows; return which (m,)."""
+        n = self._count
+        for name, store in self._stores.items():
+            if n + m > len(store):
+                roomy = np.zeros((max(n + m, 2 * len(store)), *store.shape[1:]), store.dtype)
+                roomy[:n] = store[:n]
+                self._stores[name] = roomy
+        self._show(n + m)
+        return np.arange(n, n + m)
+
+    def delete(self, rows: IntArray) -> None:
+        """Delete rows; those behind move up."""
+        left = 0
+        for store in self._stores.values():
+            kept = np.delete(store[: self._count], rows, axis=0)
+            left = len(kept)
+            store[:left], store[left : self._count] = kept, 0
+        self._show(left)
+
+    def _show(self, count: int) -> None:
+        self._count = count
+        for name, store in self._stores.items():
+            setattr(self, name, store[:count])

@@ -1,0 +1,48 @@
+"""What one hypothesis estimates, as arrays that are changed in place."""
+
+from __future__ import annotations
+
+from typing import ClassVar, TYPE_CHECKING
+
+import numpy as np
+
+from slam_observer_ros.common.columns import LandmarkColumns
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class FilterArrays(LandmarkColumns):
+    """X̂ and ξ° in the frame of P°, and the covariance of their errors where it is known.
+
+    Only this folder writes to them; others read, and copy what they keep. Attributes are
+    ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
+    each (n, 3), metres and m/s, and ``covariance``, P (N, N), empty for gains that know none.
+    ``have_moved`` says whether any landmark has had a velocity so far.
+    """
+
+    COLUMNS: ClassVar = dict.fromkeys(('y_ref', 'a', 'u'), (np.float64, (3,)))
+    y_ref: FloatArray
+    a: FloatArray
+    u: FloatArray
+
+    def __init__(self, reference_pose: FloatArray) -> None:
+        super().__init__()
+        self.reference_pose: FloatArray = np.array(reference_pose)
+        self.A: FloatArray = np.eye(4)
+        self.covariance = SymmetricMatrix(np.zeros((0, 0)))
+        self.have_moved = False
+
+    @property
+    def P(self) -> FloatArray:  # noqa: N802 (the field's name for it)
+        """(N, N) the covariance, as a view."""
+        return self.covariance.values
+
+    def copy(self) -> Self:
+        """Return an independent copy: one copy of memory an array."""
+        other = super().copy()
+        other.reference_pose, other.A = self.reference_pose.copy(), self.A.copy()
+        other.covariance = self.covariance.copy()
+        return other
