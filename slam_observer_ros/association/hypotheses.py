@@ -30,7 +30,7 @@ from slam_observer_ros.association.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.association.new_landmarks import NewLandmarks
-from slam_observer_ros.association.standing import Standing, take_back
+from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.events import (
@@ -161,9 +161,12 @@ class Hypotheses:
             state = hypothesis.state
             motion = state.motion(velocities, start_ns, end_ns)
             state.propagate(motion)
-            if state is self.best:
-                self._standing.move(motion)
-            if motion.at_ends is not None and state is self.best:
+            if state is not self.best:
+                continue
+            if len(self._standing.motions) == MAX_MOTIONS:
+                self._standing.clear_time()
+            self._standing.motions.append(motion)
+            if motion.at_ends is not None:
                 self._delay_evidence.add(velocities, motion, start_ns, end_ns)
 
     @property
@@ -199,7 +202,7 @@ class Hypotheses:
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
         standing = self._standing
-        if standing.is_due(event):
+        if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
             self._judge(event)
         if standing.excluded:
             event = event.without(standing.excluded)

@@ -58,7 +58,7 @@ MOST = 0.75
 UNSEEN_NS = to_ns(1.0)
 """For how long a slip goes on unseen."""
 
-MAX_MOTIONS = 1000
+MAX_MOTIONS = 500
 """Motions between observations that are remembered."""
 
 
@@ -192,66 +192,56 @@ class Standing:
     carried: set[int] = field(default_factory=set)
     excluded: set[int] = field(default_factory=set)  # that may be carried, and those that are
     slip: int | None = None  # which of the SLIPS goes on
+    motions: list[Motion] = field(default_factory=list)  # by odometry, since a start …
+    sensor_frame: str = ''  # an observation is due from another one, …
+    due_ns: int = 0  # … or from here on
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
     _starts: dict[str, _Look] = field(default_factory=dict)  # what is compared with, by sensor
     _latest: dict[str, _Look] = field(default_factory=dict)
     _tested: dict[str, _Look] = field(default_factory=dict)  # the latest when that was judged
-    _due_ns: int = 0
+    _test_ns: int = 0
     _wait_ns: int = TEST_NS  # until so much has passed that it is clear
     _odd: set[int] = field(default_factory=set)  # what did not pass as it should have
     _usual_m2: float = 0.0  # mean square of the ways from which on it is clear what passes, …
     _enough_m2: float = 0.0  # … or with which it is judged again
     _confirmed_ns: int = 0  # when it was seen last that a slip goes on
-    _motions: list[Motion] = field(default_factory=list)  # since a start …
     _earlier: list[Motion] = field(default_factory=list)  # … and those before that
 
     def clear_time(self) -> None:
         """Compare nothing with what was seen before."""
-        self.slip, self._due_ns = None, 0
+        self.slip, self.due_ns = None, 0
         self._starts, self._latest, self._tested = {}, {}, {}
-        self._motions, self._earlier = [], []
-
-    def move(self, motion: Motion) -> None:
-        """Remember a motion by odometry."""
-        self._motions.append(motion)
-        if len(self._motions) > MAX_MOTIONS:
-            self.clear_time()
-
-    def is_due(self, event: ObservationEvent) -> bool:
-        """Return whether an observation is to be judged: some times a second, or during slips."""
-        starts = self._starts
-        return (
-            event.stamp_ns >= self._due_ns
-            or self.slip is not None
-            or len(starts) > 1
-            or event.sensor_frame not in starts
-        )
+        self.motions, self._earlier = [], []
 
     def note(self, state: State, event: ObservationEvent) -> Lost | None:
-        """Judge an observation that is yet to be used, by the most likely state.
+        """Judge an observation that is due and yet to be used, by the most likely state.
 
         Return what was not made of the motion since the last observation if the wheels slip.
         """
         if state.landmark_velocity_stddev or event.velocities is not None:
             return None  # landmarks may move as the robot does
-        look = _Look(event, len(self._motions))
+        look, lost = _Look(event, len(self.motions)), None
         if self.slip is not None:
-            return self._go_on(state, look)
-        if event.sensor_frame in self._starts:
+            lost = self._go_on(state, look)
+        elif event.sensor_frame in self._starts:
             self._latest[event.sensor_frame] = look
-            return self._test(state, look) if event.stamp_ns >= self._due_ns else None
-        if self._starts:
+            if event.stamp_ns >= self._test_ns:
+                lost = self._test(state, look)
+        elif self._starts:
             self._starts[event.sensor_frame] = look
         else:
             self._begin(event)
-        return None
+        some_wait = self.slip is not None or len(self._starts) > 1
+        self.due_ns = 0 if some_wait else self._test_ns
+        return lost
 
     def _begin(self, event: ObservationEvent) -> None:
         """Compare with this observation from now on."""
+        self.sensor_frame = event.sensor_frame
         self._starts, self._latest = {event.sensor_frame: _Look(event, 0)}, {}
-        self._earlier, self._motions = self._motions, []
+        self._earlier, self.motions = self.motions, []
         self._tested, self._enough_m2 = {}, self._usual_m2
-        self._due_ns = event.stamp_ns + self._wait_ns
+        self._test_ns = event.stamp_ns + self._wait_ns
 
     def _test(self, state: State, look: _Look) -> Lost | None:
         """Look for a slip, and for landmarks that are carried along."""
@@ -265,7 +255,7 @@ class Standing:
         age_ns = event.stamp_ns - self._starts[event.sensor_frame].event.stamp_ns
         needed = math.sqrt(self._usual_m2 / way_m2) if way_m2 else math.inf
         self._wait_ns = int(min(max(needed * age_ns, TEST_NS), LONGEST_WAIT_NS))
-        self._due_ns = event.stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
+        self._test_ns = event.stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
         if way_m2 <= self._enough_m2:
             if age_ns > LAST_TEST_NS:
                 self._begin(event)
@@ -279,8 +269,8 @@ class Standing:
         self._enough_m2 = 2.0 * way_m2
         if self._slips(state, view):
             self._confirmed_ns, self._starts = event.stamp_ns, self._latest
-            lost = self._lost(self._motions[-1:], self._earlier + self._motions)
-            self._motions = []
+            lost = self._lost(self.motions[-1:], self._earlier + self.motions)
+            self.motions = []
             return lost
         if view.passes.any():
             self._sort(view)
@@ -300,7 +290,7 @@ class Standing:
     def _pairs(self) -> list[_Pairs]:
         """Return what each sensor has seen at the start and lately, where it has."""
         looks = [(self._starts[name], now) for name, now in self._latest.items()]
-        seen = [_Pairs.of(a, b, self._motions[a.motions : b.motions]) for a, b in looks]
+        seen = [_Pairs.of(a, b, self.motions[a.motions : b.motions]) for a, b in looks]
         return [pairs for pairs in seen if pairs.ids]
 
     def _slips(self, state: State, view: _View) -> bool:
@@ -314,7 +304,7 @@ class Standing:
 
     def _go_on(self, state: State, look: _Look) -> Lost | None:
         """Return what :meth:`note` does during a slip, or None once it is over."""
-        event, made = look.event, self._motions
+        event, made = look.event, self.motions
         self._slip_on(made)
         start = self._starts.setdefault(event.sensor_frame, _Look(event, 0))
         pairs, agree = _Pairs.of(start, look, []), np.empty(0, dtype=np.bool_)
@@ -339,7 +329,7 @@ class Standing:
         for name, start in self._starts.items():
             points = se3.transform(back, start.event.points)
             self._starts[name] = _Look(replace(start.event, points=points), 0)
-        self._motions = []
+        self.motions = []
 
     def _lost(self, made: list[Motion], whole: list[Motion]) -> Lost:
         """Return what was lost of motions, and may be of others."""
