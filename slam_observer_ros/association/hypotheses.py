@@ -43,9 +43,11 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.delay_evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import disbelieve, Outcome, step
+from slam_observer_ros.state.step import disbelieve, step
+from slam_observer_ros.state.usual import Outcome
 
 MOST_WITHOUT_IDS = 2
 """Hypotheses that are followed at most where points have no ids: each costs as much as the first,
@@ -82,6 +84,7 @@ class Hypotheses:
         self._contradictions = Contradictions()
         self._new_landmarks = NewLandmarks()
         self._standing = Standing()
+        self._velocities: VelocityHistory | None = None  # along which they were moved
         self._delay_evidence = DelayEvidence()
 
     @property
@@ -159,15 +162,21 @@ class Hypotheses:
         """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns`` (27)."""
         for hypothesis in self._all:
             state = hypothesis.state
-            motion = state.motion(velocities, start_ns, end_ns)
-            state.propagate(motion)
+            before = state.observer.A.copy()
+            variances = usual.advance(state, velocities, start_ns, end_ns)
+            if variances is None:
+                motion = state.motion(velocities, start_ns, end_ns)
+                state.propagate(motion)
+                variances = np.diagonal(motion.covariances.sum(axis=0))
             if state is not self.best:
                 continue
-            if len(self._standing.motions) == MAX_MOTIONS:
-                self._standing.clear_time()
-            self._standing.motions.append(motion)
-            if motion.at_ends is not None:
-                self._delay_evidence.add(velocities, motion, start_ns, end_ns)
+            self._standing.moved.append((before, state.observer.A.copy()))
+            calibration = state.filter.calibration
+            if calibration.delay_error_ns:
+                self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
+        if len(self._standing.moved) > MAX_MOTIONS:
+            self._standing.clear_time()
+        self._velocities = velocities
 
     @property
     def calibration(self) -> list[CalibrationEstimate]:
@@ -211,10 +220,10 @@ class Hypotheses:
     def _judge(self, event: ObservationEvent) -> None:
         """Stop where the wheels spin, and give up landmarks that the robot carries."""
         standing, best = self._standing, self.best
-        if not best.filter.has_joint_covariance:
+        if not best.filter.has_joint_covariance or self._velocities is None:
             return
         was_slipping, were_carried = standing.slip is not None, standing.carried
-        lost = standing.note(best, event)
+        lost = standing.note(best, event, self._velocities)
         newly = standing.carried - were_carried
         for hypothesis in self._all:
             state = hypothesis.state
@@ -230,6 +239,9 @@ class Hypotheses:
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
+        if len(self._all) == 1 and (outcome := usual.observe(self.best, event)) is not None:
+            self._some_have_ids = True
+            return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         matches = [match(hypothesis.state, event) for hypothesis in self._all]

@@ -194,10 +194,11 @@ def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
 
 def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:
     """Return which points (m,) only pass the gate as the state is so uncertain."""
-    far = are_far(sensor_distances, state.settings)
+    gate = state.settings.rejection_threshold
+    far = are_far(sensor_distances, gate)
     if far.any():
         r, noise = residuals.on(state.axes)
-        far &= far_from_the_others(r, state.filter.predicted(residuals)[1], noise, state.settings)
+        far &= far_from_the_others(r, state.filter.predicted(residuals)[1], noise, gate)
     return far
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 import math
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -19,7 +20,9 @@ from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.sensor_models.integration import integrate
 from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.state import State
 
 TEST_NS, LONGEST_WAIT_NS = to_ns(0.25), to_ns(1.0)
@@ -62,12 +65,16 @@ MAX_MOTIONS = 500
 """Motions between observations that are remembered."""
 
 
+Move: TypeAlias = tuple[FloatArray, FloatArray]
+"""Â (4, 4) before a motion by odometry, and after it; the corrections are in between."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """An observation, and how many of the motions that are remembered were before it."""
+    """An observation, and how many of the moves that are remembered were before it."""
 
     event: ObservationEvent
-    motions: int
+    moves: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,20 +87,20 @@ class _Pairs:
     before: FloatArray
     points: FloatArray
     expected: FloatArray  # where odometry has them
-    motion: FloatArray  # (4, 4) in between, by odometry, …
-    motions: list[Motion]  # … in pieces
+    motion: FloatArray  # (4, 4) in between, by odometry
+    since_ns: int
 
     @classmethod
-    def of(cls, start: _Look, now: _Look, motions: list[Motion]) -> _Pairs:
-        """Return those of two looks, between which there were ``motions``."""
+    def of(cls, start: _Look, now: _Look, moved: list[Move]) -> _Pairs:
+        """Return those of two looks, between which the robot has ``moved`` by odometry."""
         first = {i: row for row, i in enumerate(start.event.ids.tolist()) if i != UNKNOWN_ID}
         both = [(row, i) for row, i in enumerate(now.event.ids.tolist()) if i in first]
         rows, ids = [row for row, _ in both], [i for _, i in both]
         before = start.event.points[[first[i] for i in ids]]
-        motion = _product(motions)
+        motion = _product(moved)
         expected = (before - motion[:3, 3]).dot(motion[:3, :3])
         points = now.event.points[rows]
-        return cls(now.event, rows, ids, before, points, expected, motion, motions)
+        return cls(now.event, rows, ids, before, points, expected, motion, start.event.stamp_ns)
 
     @property
     def lagging(self) -> list[int]:
@@ -129,7 +136,7 @@ class _View:
     motion_noise: FloatArray  # (p, p)
 
     @classmethod
-    def of(cls, state: State, seen: list[_Pairs]) -> _View:
+    def of(cls, state: State, seen: list[_Pairs], velocities: VelocityHistory) -> _View:
         """Return what pairs of points of one sensor or several show."""
         k, A = state.axes.point, state.observer.A
         noise = _noise(state, seen)
@@ -141,7 +148,8 @@ class _View:
         squared = np.einsum('smi,mij,smj->sm', shifts, np.linalg.inv(noise), shifts)
         shift, *slips = np.sqrt(np.maximum(squared, 0.0))
         C = transpose(A[:k, :k]) @ state.axes.output_matrix(se3.transform(A, expected))
-        motion_noise = _motion_noise(state, max((pairs.motions for pairs in seen), key=len))
+        longest = min(seen, key=lambda pairs: pairs.since_ns)
+        motion_noise = _motion_noise(state, longest, velocities)
         S, way = noise + C @ motion_noise @ transpose(C), (expected - before)[:, :k]
         off = (now - expected)[:, :k]
         error, way = mahalanobis(off, S), mahalanobis(way, S)
@@ -192,7 +200,7 @@ class Standing:
     carried: set[int] = field(default_factory=set)
     excluded: set[int] = field(default_factory=set)  # that may be carried, and those that are
     slip: int | None = None  # which of the SLIPS goes on
-    motions: list[Motion] = field(default_factory=list)  # by odometry, since a start …
+    moved: list[Move] = field(default_factory=list)  # by odometry, since a start …
     sensor_frame: str = ''  # an observation is due from another one, …
     due_ns: int = 0  # … or from here on
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
@@ -205,28 +213,30 @@ class Standing:
     _usual_m2: float = 0.0  # mean square of the ways from which on it is clear what passes, …
     _enough_m2: float = 0.0  # … or with which it is judged again
     _confirmed_ns: int = 0  # when it was seen last that a slip goes on
-    _earlier: list[Motion] = field(default_factory=list)  # … and those before that
+    _earlier: list[Move] = field(default_factory=list)  # … and that before
 
     def clear_time(self) -> None:
         """Compare nothing with what was seen before."""
         self.slip, self.due_ns = None, 0
         self._starts, self._latest, self._tested = {}, {}, {}
-        self.motions, self._earlier = [], []
+        self.moved, self._earlier = [], []
 
-    def note(self, state: State, event: ObservationEvent) -> Lost | None:
+    def note(
+        self, state: State, event: ObservationEvent, velocities: VelocityHistory
+    ) -> Lost | None:
         """Judge an observation that is due and yet to be used, by the most likely state.
 
         Return what was not made of the motion since the last observation if the wheels slip.
         """
         if state.landmark_velocity_stddev or event.velocities is not None:
             return None  # landmarks may move as the robot does
-        look, lost = _Look(event, len(self.motions)), None
+        look, lost = _Look(event, len(self.moved)), None
         if self.slip is not None:
             lost = self._go_on(state, look)
         elif event.sensor_frame in self._starts:
             self._latest[event.sensor_frame] = look
             if event.stamp_ns >= self._test_ns:
-                lost = self._test(state, look)
+                lost = self._test(state, look, velocities)
         elif self._starts:
             self._starts[event.sensor_frame] = look
         else:
@@ -239,11 +249,11 @@ class Standing:
         """Compare with this observation from now on."""
         self.sensor_frame = event.sensor_frame
         self._starts, self._latest = {event.sensor_frame: _Look(event, 0)}, {}
-        self._earlier, self.motions = self.motions, []
+        self._earlier, self.moved = self.moved, []
         self._tested, self._enough_m2 = {}, self._usual_m2
         self._test_ns = event.stamp_ns + self._wait_ns
 
-    def _test(self, state: State, look: _Look) -> Lost | None:
+    def _test(self, state: State, look: _Look, velocities: VelocityHistory) -> Lost | None:
         """Look for a slip, and for landmarks that are carried along."""
         event, seen = look.event, self._pairs()
         ids = [i for pairs in seen for i in pairs.ids]
@@ -264,13 +274,13 @@ class Standing:
             self._usual_m2 *= FORGOTTEN
             self._begin(event)
             return None
-        view = _View.of(state, seen)
+        view = _View.of(state, seen, velocities)
         self._usual_m2 = way_m2 * USUAL**2 / np.mean(view.way**2)
         self._enough_m2 = 2.0 * way_m2
         if self._slips(state, view):
             self._confirmed_ns, self._starts = event.stamp_ns, self._latest
-            lost = self._lost(self.motions[-1:], self._earlier + self.motions)
-            self.motions = []
+            lost = self._lost(self.moved[-1:], self._earlier + self.moved)
+            self.moved = []
             return lost
         if view.passes.any():
             self._sort(view)
@@ -278,7 +288,7 @@ class Standing:
         elif view.is_mixed and tested:
             # A slip has begun meanwhile, or ended.
             self._starts, self._tested, self._enough_m2 = tested, {}, 0.0
-            return self._test(state, look)
+            return self._test(state, look, velocities)
         return None
 
     def _is_usual(self, ids: list[int], lagging: set[int]) -> bool:
@@ -290,7 +300,7 @@ class Standing:
     def _pairs(self) -> list[_Pairs]:
         """Return what each sensor has seen at the start and lately, where it has."""
         looks = [(self._starts[name], now) for name, now in self._latest.items()]
-        seen = [_Pairs.of(a, b, self.motions[a.motions : b.motions]) for a, b in looks]
+        seen = [_Pairs.of(a, b, self.moved[a.moves : b.moves]) for a, b in looks]
         return [pairs for pairs in seen if pairs.ids]
 
     def _slips(self, state: State, view: _View) -> bool:
@@ -304,7 +314,7 @@ class Standing:
 
     def _go_on(self, state: State, look: _Look) -> Lost | None:
         """Return what :meth:`note` does during a slip, or None once it is over."""
-        event, made = look.event, self.motions
+        event, made = look.event, self.moved
         self._slip_on(made)
         start = self._starts.setdefault(event.sensor_frame, _Look(event, 0))
         pairs, agree = _Pairs.of(start, look, []), np.empty(0, dtype=np.bool_)
@@ -323,15 +333,15 @@ class Standing:
             return None
         return self._lost(made, made)
 
-    def _slip_on(self, made: list[Motion]) -> None:
+    def _slip_on(self, made: list[Move]) -> None:
         """Move what is compared with by what a slip makes of motions; forget these."""
         back = se3.exp(-SLIPS[self.slip or 0] * se3.log(_product(made)))
         for name, start in self._starts.items():
             points = se3.transform(back, start.event.points)
             self._starts[name] = _Look(replace(start.event, points=points), 0)
-        self.motions = []
+        self.moved = []
 
-    def _lost(self, made: list[Motion], whole: list[Motion]) -> Lost:
+    def _lost(self, made: list[Move], whole: list[Move]) -> Lost:
         """Return what was lost of motions, and may be of others."""
         share, motion = SLIPS[self.slip or 0], _product(made)
         back = se3.inverse(motion).dot(se3.exp(share * se3.log(motion)))
@@ -363,27 +373,30 @@ def _noise(state: State, seen: list[_Pairs]) -> FloatArray:
     return both
 
 
-def _product(motions: list[Motion]) -> FloatArray:
-    """Return motions, one after the other, as one (4, 4), in the robot's frame at their start."""
-    if not motions:
+def _product(moved: list[Move]) -> FloatArray:
+    """Return moves, one after the other, as one motion (4, 4), in the frame at their start."""
+    if not moved:
         return np.eye(4)
-    ends = np.array([(motion.path[0], motion.path[-1]) for motion in motions])
-    whole, *others = np.linalg.solve(ends[:, 0], ends[:, 1])
+    befores, afters = np.array(moved).swapaxes(0, 1)
+    whole, *others = np.linalg.solve(befores, afters)
     for step in others:
         whole = whole.dot(step)
     product: FloatArray = whole
     return product
 
 
-def _motion_noise(state: State, motions: list[Motion]) -> FloatArray:
-    """Return the covariance (p, p) of motions by odometry, with that of its bias."""
-    # A sensor whose calibration has begun since has no part in it.
-    c = motions[0].sensitivity.shape[1]
-    F = np.sum([motion.sensitivity[:, :c] for motion in motions], axis=0)
-    noise = np.sum([motion.noise for motion in motions], axis=0)
+def _motion_noise(state: State, pairs: _Pairs, velocities: VelocityHistory) -> FloatArray:
+    """Return the covariance (p, p) of the motion between them, with that of its bias."""
+    calibration, end_ns = state.filter.calibration, pairs.event.stamp_ns
+    # What led there so long ago that it is forgotten was off by as much.
+    since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)
+    start = state.observer.A.dot(se3.inverse(pairs.motion))
+    motion = integrate(velocities, calibration, state.motion_noise, start, since_ns, end_ns, None)
+    longer = (end_ns - pairs.since_ns) / max(end_ns - since_ns, 1)
+    F = longer * motion.sensitivity
     # As it is stated: what slips and carried landmarks have added to it is no reason to wait.
-    noise = noise / max(1.0, state.motion_noise.factors.applied.max())
-    total: FloatArray = noise + (F * state.filter.calibration_variances[:c]) @ F.T
+    noise = longer / max(1.0, state.motion_noise.factors.applied.max()) * motion.noise
+    total: FloatArray = noise + (F * state.filter.calibration_variances) @ F.T
     return total
 
 

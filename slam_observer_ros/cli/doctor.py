@@ -17,6 +17,7 @@ from slam_observer_ros.cli.fitting_file import fitting_file
 from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.observer import core
 
 LISTENER = 'slam_observer_ros.nodes.live_inputs'
 """The program that hears topics; it is one of its own, as only ``nodes/`` knows ROS."""
@@ -91,6 +92,7 @@ def _installed() -> dict[str, str]:
         'slam_observer_ros': VERSION,
         'Python': f'{platform.python_version()} ({sys.executable})',
         'ROS': _ros(),
+        'step of the filter': core.description(),
     }
     for package, use in MESSAGE_PACKAGES.items():
         found[package] = _presence(find_spec(package) is not None, use)

@@ -44,7 +44,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import Outcome
+from slam_observer_ros.state.usual import Outcome
 
 logger = logging.getLogger(__name__)
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.expected import Expected
@@ -27,17 +24,7 @@ from slam_observer_ros.state.tag_orientations import (
     seen_orientations,
     take_over_orientations,
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What an observation did to a state."""
-
-    ids: IntArray  # (m,) ids of the landmarks seen that were known before
-    residuals: FloatArray  # (m, 3) before the correction, metres, reference frame
-    rejected: BoolArray  # (m,) which of them were too far off to be used
-    moved_ids: IntArray  # ids of landmarks that it showed to have moved
-    innovation: NormalisedInnovation | None = None
+from slam_observer_ros.state.usual import Outcome
 
 
 def step(state: State, matched: MatchedObservation) -> Outcome:

@@ -39,9 +39,10 @@ def test_folders_show_the_architecture(structure):
 
 def test_a_step_with_ids_takes_no_more_calls_than_it_did(structure):
     step = structure.traced_step()
-    assert len(step.modules) <= 37  # one of them is the columns of all tables
-    assert step.changes <= 140  # 7 of them find out how noisy the motion is
-    assert step.depth <= 14
+    # Of the reference in numpy; with the compiled core it is half as many.
+    assert len(step.modules) <= 28
+    assert step.changes <= 91
+    assert step.depth <= 11
 
 
 def test_docstrings_are_a_fifth_of_all_lines_at_most(structure):
