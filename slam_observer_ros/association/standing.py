@@ -228,7 +228,7 @@ class Standing:
 
         Return what was not made of the motion since the last observation if the wheels slip.
         """
-        if state.landmark_velocity_stddev or event.velocities is not None:
+        if event.velocities is not None:
             return None  # landmarks may move as the robot does
         look, lost = _Look(event, len(self.moved)), None
         if self.slip is not None:
@@ -270,7 +270,8 @@ class Standing:
             if age_ns > LAST_TEST_NS:
                 self._begin(event)
             return None
-        if self._is_usual(ids, {i for pairs in seen for i in pairs.lagging}):
+        is_usual = self._is_usual(ids, {i for pairs in seen for i in pairs.lagging})
+        if is_usual or state.landmark_velocity_stddev:
             self._usual_m2 *= FORGOTTEN
             self._begin(event)
             return None
