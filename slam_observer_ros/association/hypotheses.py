@@ -10,7 +10,7 @@ have ids or are well separated there is nearly always one.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -92,9 +92,10 @@ class Hypotheses:
         """Outcomes for landmarks, in the most likely state and those given up by resets."""
         return self._earlier_counts + self.best.counts
 
-    def count(self, name: str) -> int:
-        """Return one of the :attr:`counts`, without adding up all of them."""
-        return self._earlier_counts.get(name, 0) + self.best.counts.get(name, 0)
+    def some_counts(self, names: Iterable[str]) -> list[int]:
+        """Return some of the :attr:`counts`, without adding up all of them."""
+        earlier, counts = self._earlier_counts, self.best.counts
+        return [earlier.get(name, 0) + counts.get(name, 0) for name in names]
 
     def __len__(self) -> int:
         """Return how many hypotheses there are."""

@@ -12,13 +12,15 @@ import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimator.event_warnings import EventWarnings
+from slam_observer_ros.estimator.event_warnings import EventWarnings, listed
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
+    FIRST_AUTOMATIC_ID,
     flatten,
     IMPOSSIBLE_ID,
     is_automatic,
+    LAST_AUTOMATIC_ID,
     MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,
@@ -337,29 +339,30 @@ def usable_points(
     if event.orientations is not None and settings.use_tag_orientation:
         event = replace(event, orientations=so3.exact(event.orientations))
     if (impossible := event.ids == IMPOSSIBLE_ID).any():
-        warnings.impossible_ids(int(np.sum(impossible)))
+        warnings.warn('impossible_id', count=int(np.sum(impossible)))
         counts['impossible_id'] += int(np.sum(impossible))
         event = event.select(~impossible)
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
-        warnings.reserved_ids(event.ids[reserved].tolist())
+        ids = listed(event.ids[reserved].tolist())
+        warnings.warn('reserved_id', ids=ids, first=FIRST_AUTOMATIC_ID, last=LAST_AUTOMATIC_ID)
         counts['reserved_id'] += int(np.sum(reserved))
         event = event.select(~reserved)
     if repeated_ids := event.repeated_ids():  # nobody knows which of the points is right
-        warnings.repeated_ids(repeated_ids)
+        warnings.warn('repeated_id', ids=listed(repeated_ids))
         repeated = np.isin(event.ids, repeated_ids)
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
     unknown = event.ids == UNKNOWN_ID
     if needs_ids and np.count_nonzero(unknown):
-        warnings.unknown_ids(settings.gains)
+        warnings.warn('unknown_id', gains=settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)
     elif not needs_ids and len(event.ids) > MAX_WEIGHED:
         warnings.many_points(len(event.ids))
         if unknown.any() or is_automatic(landmarks.ids).any():
             counts['unweighed_point'] += len(event.ids) - MAX_WEIGHED
-            warnings.unweighed_points(len(event.ids), MAX_WEIGHED)
+            warnings.warn('unweighed_point', count=len(event.ids), most=MAX_WEIGHED)
             event = event.select(_first_weighed(event, unknown))
     return event
 

@@ -23,7 +23,7 @@ from slam_observer_ros.estimator.checks import (
     usable_points,
 )
 from slam_observer_ros.estimator.event_queue import EventQueue
-from slam_observer_ros.estimator.event_warnings import EventWarnings
+from slam_observer_ros.estimator.event_warnings import EventWarnings, UNEXPECTED_POSES
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -336,7 +336,7 @@ class Estimator:
         landmark_map = map_of(self._state, self._localiser.loaded if self.is_localised else None)
         has_covariances = landmark_map.covariances is not None
         if has_covariances and landmark_map.joint_covariance is None and not self._state.is_fixed:
-            self._warnings.left_out_correlations(len(landmark_map.ids))
+            self._warnings.warn('left_out_correlations', count=len(landmark_map.ids))
         return landmark_map
 
     @property
@@ -483,7 +483,7 @@ class Estimator:
 
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
-        self._warnings.dropped(error)
+        self._warnings.warn('dropped_message', error.reason, reason=error.reason, error=error)
 
     def _push_velocities(self, velocities: VelocityBlock) -> bool:
         """Put velocities in the queue if none of them needs to be looked at for itself."""
@@ -536,7 +536,7 @@ class Estimator:
             self._counts['velocity'] += 1
         if is_late:
             self._counts['late_velocity'] += 1
-            self._warnings.late_velocity()
+            self._warnings.warn('late_velocity')
 
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings
@@ -676,12 +676,12 @@ class Estimator:
         warnings, state = self._warnings, self._state
         limit = self.settings.max_landmarks if state.is_mapping else 0
         if 0 < limit < len(event.ids):
-            warnings.more_than_max(len(event.ids), limit)
+            warnings.warn('more_than_max', count=len(event.ids), limit=limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
-        warnings.unexpected_poses(self._hypotheses.count)
+        warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
         warnings.large_map(len(state.landmarks), limit, is_dense)

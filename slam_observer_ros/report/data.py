@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 import math
 import sys
 
@@ -12,9 +11,8 @@ from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.report.curves import calibration, consistency, drops, errors
-from slam_observer_ros.report.findings import findings
 from slam_observer_ros.report.lists import Json, rounded
-from slam_observer_ros.report.reported_run import ReportedRun
+from slam_observer_ros.runs.reported_run import ReportedRun
 from slam_observer_ros.settings.parameter_table import changed_names, table
 
 MAX_PATH = 4000
@@ -32,10 +30,6 @@ UPPER = np.triu_indices(3)
 def report_data(run: ReportedRun) -> dict[str, Json]:
     """Return all that the page shows of a run."""
     return {
-        'title': run.title,
-        'figures': [[name, value] for name, value in run.figures.items()],
-        'findings': [asdict(finding) for finding in findings(run)],
-        'warnings': list(run.warnings),
         'settings': _settings(run),
         'versions': [
             ['slam_observer_ros', VERSION],

@@ -203,7 +203,7 @@ def test_what_the_robot_carries_is_no_place(name, from_s, caplog):
     assert max(estimator.landmark_ids) < 100
     assert estimator.counts['slip'] == 0
     assert off_m[-1] < 0.15
-    assert 'landmarks 100, 101, 102 move with the robot' in caplog.text
+    assert 'Landmarks 100, 101, 102 move with the robot' in caplog.text
 
 
 def test_what_it_has_put_down_is_a_place_again():

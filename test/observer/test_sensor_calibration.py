@@ -19,6 +19,7 @@ from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.runs.health import of_mounting
 from slam_observer_ros.sensor_models import sensing, sensor_calibration
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -325,7 +326,8 @@ def test_what_was_found_is_said_as_what_to_set(name, value, text):
     part = CalibrationEstimate(
         name, value, 0.01, UNITS[name.split('/')[0]], float('scale' in name), 0.035
     )
-    assert part.advice == text or text in part.advice != ''
+    said = ''.join(finding.text() for finding in of_mounting([part]))
+    assert said == text or text in said != ''
 
 
 UNITS = dict(zip(sensor_calibration.NAMES, sensor_calibration.UNITS, strict=True)) | {

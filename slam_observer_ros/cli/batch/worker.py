@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slam_observer_ros.cli.batch.jobs import Job
 from slam_observer_ros.cli.console import kept_warnings
-from slam_observer_ros.cli.replay.asked import without_outputs
-from slam_observer_ros.cli.replay.identity import identity
+from slam_observer_ros.cli.replay.files import write_report_of
+from slam_observer_ros.cli.replay.request import Records
 from slam_observer_ros.cli.replay.run import replayed
-from slam_observer_ros.cli.replay.summary import as_json, summary_rows
+from slam_observer_ros.cli.replay.summary import as_json, identity, summary_rows
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.trajectory import write_tum
@@ -22,33 +21,32 @@ REPORTS, TRAJECTORIES = 'reports', 'trajectories'
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """Does the jobs of a batch; ``args`` are its options."""
+    """Does the jobs of a batch, and writes those files of each that are asked for."""
 
-    args: argparse.Namespace
     out: Path
+    writes_reports: bool
+    writes_trajectories: bool
     version: str = VERSION
 
     def __call__(self, job: Job) -> dict[str, object]:
         """Do a run, write its files, and return its line of the log."""
         if self.version != VERSION:
             raise UsageError(f'this worker has version {VERSION}, the batch {self.version}')
-        args = without_outputs(self.args, job.recording)
-        args.report = self._file(REPORTS, job, '.html') if self.args.reports else None
-        args.tum = self._file(TRAJECTORIES, job, '.tum') if self.args.trajectories else None
+        report = self._file(REPORTS, job, '.html') if self.writes_reports else None
+        tum = self._file(TRAJECTORIES, job, '.tum') if self.writes_trajectories else None
+        records = Records(poses=tum is not None, whole_run=report is not None)
         with kept_warnings() as warnings:
-            outcome, _ = replayed(args, job.asked, shows_progress=False)
+            outcome, _ = replayed(replace(job.request, records=records), shows_progress=False)
         outcome = replace(outcome, warnings=warnings)
-        if args.tum is not None:
-            write_tum(outcome.trajectory, args.tum)
-        if args.report is not None:
-            from slam_observer_ros.cli.replay.drawn import write_report_of  # takes a while to load
-
-            write_report_of(job.file_stem, outcome, summary_rows(outcome), args.report)
+        if tum is not None:
+            write_tum(outcome.trajectory, tum)
+        if report is not None:
+            write_report_of(job.file_stem, outcome, summary_rows(outcome), report)
         return {
             'run': job.run_id,
             'grid': job.point,
-            'report': self._relative(args.report),
-            'trajectory': self._relative(args.tum),
+            'report': self._relative(report),
+            'trajectory': self._relative(tum),
             **identity(job.recording, job.recording_sha256, outcome),
             **as_json(outcome),
         }

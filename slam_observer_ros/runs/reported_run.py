@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,13 +27,8 @@ class ReportedRun:
 
     ``trajectory`` is the online one and ``errors`` its errors; ``dead_reckoning`` is that of the
     velocities alone; ``anees`` is that of the pose. Both are None where there is no truth.
-    ``nothing_used`` says if of velocities or observations none was of use, else it is empty.
     """
 
-    title: str
-    nothing_used: str
-    figures: Mapping[str, str]
-    warnings: Sequence[str]
     settings: Settings
     start_ns: int
     trajectory: Trajectory
@@ -63,6 +58,19 @@ class ReportedRun:
     def calibration(self) -> Sequence[CalibrationEstimate]:
         """What was found out about the velocity in the end."""
         return self.instants[-1].calibration if self.instants else ()
+
+    def calibration_over_time(self, name: str) -> tuple[FloatArray, list[CalibrationEstimate]]:
+        """Return when a property was estimated, seconds, and what was known of it at each time.
+
+        That of a sensor begins where the sensor is heard first.
+        """
+        known = [
+            (row, part)
+            for row, instant in enumerate(self.instants)
+            for part in instant.calibration
+            if part.name == name
+        ]
+        return self.instants_s[[row for row, _ in known]], [part for _, part in known]
 
     @property
     def used_s(self) -> FloatArray:
