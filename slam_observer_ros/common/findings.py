@@ -322,6 +322,11 @@ KINDS = {
         'landmarks {ids} have moved',
         'if they have not, state more noise, or look at odometry and ids',
     ),
+    'carried_landmark': Kind(
+        Level.WARNING,
+        'landmarks {ids} move with the robot, and are not used',
+        'nothing is wrong if it carries them; where they stay behind they are used again',
+    ),
     'many_moved': Kind(
         Level.WARNING,
         '{count} landmarks seem to have moved within a minute: odometry may err by more than is '
