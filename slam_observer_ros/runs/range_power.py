@@ -12,9 +12,8 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import RangePower, Update
-from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import flatten, ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.sensing import cosines, LEAST_COSINE
@@ -53,19 +52,18 @@ class RangeErrors:
         if len(self._errors) < MAX_OBSERVATIONS:
             self._waiting.append(flatten(event) if self._is_planar else event)
 
-    def note_update(self, update: Update, estimator: Estimator) -> None:
-        """Take in what an observation was found to be."""
+    def note_update(self, update: Update, known: IntArray, world_points: FloatArray) -> None:
+        """Take in what an observation was found to be, and where landmarks ``known`` (n,) are."""
         event = next((each for each in self._waiting if each.stamp_ns == update.stamp_ns), None)
         if event is None:
             return
         self._waiting.remove(event)
-        known = estimator.landmark_ids
         used = np.intersect1d(update.ids, known)
         _, seen, rows = np.intersect1d(event.ids, used, return_indices=True)
         if not len(rows):
             return
         at = np.argsort(known)[np.searchsorted(np.sort(known), used[rows])]
-        points = se3.transform(se3.inverse(update.pose), estimator.world_points[at])
+        points = se3.transform(se3.inverse(update.pose), world_points[at])
         shown = event.lines_of_sight[seen]
         arms = points - (event.points - event.lines_of_sight)[seen]
         cosine = cosines(arms, event.sensor_axis)

@@ -264,7 +264,8 @@ class _RunningReplay:
             self._updates.append(update)
         for recorder in self._recorders:
             recorder.note_update(update)
-        self._ranges.note_update(update, self._estimator)
+        known, world_points = self._estimator.landmark_ids, self._estimator.world_points
+        self._ranges.note_update(update, known, world_points)
         self._count_observation()
         self._compare_with_truth(update)
 

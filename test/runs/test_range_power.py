@@ -16,9 +16,9 @@ from slam_observer_ros.settings.estimator_settings import Settings
 CAMERA = Settings(
     angular_velocity_noise=(0.005,) * 3,
     linear_velocity_noise=(0.01,) * 3,
-    range_noise=0.02,
-    range_scale_noise=0.02,
-    bearing_noise=0.01,
+    range_noise=0.05,
+    range_scale_noise=0.03,
+    bearing_noise=0.02,
     velocity_delay_stddev=0.0,
 )
 
@@ -29,11 +29,11 @@ def seen_ahead(settings, power, axis=None):
 
     def shown(_, event):
         cosine = event.points @ forward / np.linalg.norm(event.points, axis=1)
-        ahead = cosine > 0.7
+        ahead = cosine > 0.75
         points = event.points[ahead] * cosine[ahead, None] ** power
         return replace(event, ids=event.ids[ahead], points=points, sensor_axis=axis)
 
-    world = drive(settings, 40.0, landmarks=16, seen=16)
+    world = drive(settings, 60.0, landmarks=25, seen=25)
     return world.with_observations(shown).events
 
 
