@@ -10,10 +10,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
-from slam_observer_ros.common.errors import MessageError, RecordingError
+import numpy as np
+
+from slam_observer_ros.common.errors import MessageError, RecordingError, TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import Event, VelocityBlock
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import (
     drop_reason,
     DropError,
@@ -250,6 +253,22 @@ class Recording:
             base_in = base_in_frames(frames, base_frame, transforms)
         landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)
         return Truth.from_messages(poses, base_in, landmarks)
+
+    def sensor_pose(
+        self, selected: SelectedTopics, inputs: InputSettings, frame: str
+    ) -> FloatArray | None:
+        """Return the pose (4, 4) of the landmarks' sensor in the base frame; None if it moves.
+
+        ``frame`` is the sensor's, '' for the base frame itself.
+        """
+        if any(inputs.sensor_pose):
+            return se3.from_rpy(inputs.sensor_pose)
+        if frame in ('', inputs.base_frame):
+            return np.eye(4)
+        try:
+            return self._static_transforms(selected).lookup(inputs.base_frame, frame, 0)
+        except TransformError:
+            return None
 
     def _true_poses(self, topic: Topic | None) -> Iterator[PoseBlock]:
         for raw in self._source.blocks((topic,), topic) if topic else ():

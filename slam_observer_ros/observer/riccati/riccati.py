@@ -197,8 +197,8 @@ class RiccatiFilter(Filter):
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
-        super().remove(rows)
         self.joint.remove(rows)
+        super().remove(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact; P is that of pose and calibration from now on."""
@@ -329,11 +329,15 @@ class RiccatiFilter(Filter):
         return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
 
     def _compress_if_large(self, added: int) -> None:
-        """Go on with a covariance for many landmarks, unless they move or have orientations."""
-        is_large = len(self.observer.y_ref) + added > self.block.dense
+        """Go on with a covariance for many landmarks, unless they move."""
+        # Tags count by what is estimated of them: relinearising ends there, too.
+        count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
+        is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        if self.joint.is_dense and is_large and not may_move and self.orientations is None:
-            self.joint = CompressedCovariance(self.joint, self.observer, self.block)
+        if self.joint.is_dense and is_large and not may_move:
+            self.joint = CompressedCovariance(
+                self.joint, self.observer, self.block, self.orientations
+            )
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x)."""
