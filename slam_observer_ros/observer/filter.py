@@ -121,6 +121,10 @@ class Filter:
         """Take in a map's orientations (m, 3, 3), reference frame, with ``sigmas`` (m,), rad."""
         raise NotImplementedError
 
+    def orientation_matrices(self, rows: IntArray) -> FloatArray:
+        """Return orientations (m, 3, 3), reference frame, zero where none is known."""
+        raise NotImplementedError
+
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
         """Return the standard deviations (m,) of orientations, rad."""
         raise NotImplementedError

@@ -82,7 +82,7 @@ def advance(
 
 def observe(state: State, event: ObservationEvent) -> Outcome | None:
     """Let a state use an observation (28)–(31) made at its instant."""
-    if not 0 < len(event.ids) <= AT_ONCE or not len(state.landmarks):
+    if not 0 < len(event.ids) <= AT_ONCE or not len(state.landmarks.ids):
         return None
     x, seen = _estimate(state), _seen(state, event)
     if x is None or seen is None:
@@ -134,7 +134,9 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
 def _estimate(state: State) -> Estimate | None:
     """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
     joint, observer, calibration = state.filter.joint, state.observer, state.filter.calibration
-    if type(joint) is not JointCovariance or observer.have_moved:
+    if type(joint) is not JointCovariance or joint.chart.stride > state.axes.point:
+        return None
+    if observer.have_moved:
         return None
     return Estimate(
         observer.A,

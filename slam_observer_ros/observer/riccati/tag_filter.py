@@ -1,28 +1,28 @@
 """The Riccati filter for landmarks that may have orientations, as tags do.
 
 The orientations seen correct it by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the coordinates of
-:mod:`.tag_covariance` that is H x with a constant H, too. Then the points do, as ever. Both noises
+:mod:`.chart` that is H x with a constant H, too. Then the points do, as ever. Both noises
 are taken to be independent, so to first order that is the same as both at once. Covariances
 (m, 3, 3) are those of rotation vectors, rad².
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import (
     flip_verdicts,
     LandmarkOrientations,
     SeenOrientations,
 )
+from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
-from slam_observer_ros.observer.riccati.tag_covariance import ExactTagMapCovariance, TagCovariance
 from slam_observer_ros.observer.robust import distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -35,11 +35,10 @@ class RiccatiTagFilter(RiccatiFilter):
     """Gains from the full covariance of pose, calibration, landmarks and their orientations."""
 
     orientations: LandmarkOrientations
-    joint: TagCovariance
+    estimates_orientations: ClassVar[bool] = True
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        self.joint = TagCovariance(self.axes, self.calibration, self.observer.covariance)
         self.orientations = LandmarkOrientations()
         self._is_exact = False  # the map
 
@@ -47,6 +46,8 @@ class RiccatiTagFilter(RiccatiFilter):
         """Return an independent copy."""
         other = super().copy()
         other.orientations = self.orientations.copy()
+        if isinstance(other.joint, CompressedCovariance):
+            other.joint.orientations = other.orientations
         return other
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
@@ -94,19 +95,26 @@ class RiccatiTagFilter(RiccatiFilter):
         # Of those that both have, B̂_i B_iᵀ = exp(ω_i), unless they contradict each other.
         known, R = rows[own], R[own]
         omega = self.axes.turns(so3.log(self.orientations.B[known] @ transpose(B[own])))
-        near = distances(omega, self.joint.project_own_turns(known)[1], R)
+        near = mahalanobis(omega, self.joint.own_turns(known) + R)
         agree = near <= self._settings.rejection_threshold
         if agree.any():
+            self.joint.activate(known[agree])
             HP, HPH = self.joint.project_own_turns(known[agree])
             S = with_blocks(HPH, R[agree])
             self._move(-self.joint.update(HP, S, omega[agree].ravel()))
+
+    def orientation_matrices(self, rows: IntArray) -> FloatArray:
+        """Return B̂_i (m, 3, 3) of landmarks, zero for those that have none."""
+        B: FloatArray = self.orientations.B[rows]
+        if isinstance(self.joint, CompressedCovariance):
+            return self.joint.turned(rows, B)
+        return B
 
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
         """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
         if self._is_exact:
             return self.orientations.map_sigmas[rows]
-        _, P = self.joint.project_own_turns(rows)
-        largest = np.linalg.eigvalsh(diagonal_blocks(P, self.axes.turn))[:, -1]
+        largest = np.linalg.eigvalsh(self.joint.own_turns(rows))[:, -1]
         return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
 
     def _turns(self, rows: IntArray, Z: FloatArray) -> FloatArray:
@@ -198,9 +206,7 @@ class RiccatiTagFilter(RiccatiFilter):
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact, and their orientations."""
-        joint = ExactTagMapCovariance(self.axes, self.joint, covariances)
         super().fix_landmarks(y_ref, covariances)
-        self.joint = joint
         self._is_exact = True
         self.orientations = LandmarkOrientations()  # until the map says what they are
         self.orientations.append_zeros(len(y_ref))
@@ -208,5 +214,6 @@ class RiccatiTagFilter(RiccatiFilter):
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x), and the orientations: B̂_i ← exp(ω_i) B̂_i."""
         super()._move(x)
-        if not self._is_exact:
-            self.orientations.turn(self.joint.turns(x))
+        turns = self.joint.chart.step(x).turns
+        if turns is not None:
+            self.orientations.turn(self.joint.active, so3.exp(turns))
