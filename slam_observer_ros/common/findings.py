@@ -133,7 +133,7 @@ KINDS = {
     'late_odometry': Kind(
         Level.WARNING,
         'the odometry takes effect {delay_s:.2f} s {when}',
-        'mind it in the driver (Tune the noise)',
+        'mind it in the driver, or set velocity_delay: {set_to:.2f} (Tune the noise)',
     ),
     'implausible_calibration': Kind(
         Level.WARNING,

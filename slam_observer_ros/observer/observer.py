@@ -72,10 +72,12 @@ class Observer(FilterArrays):
         self.A[...] = D.dot(self.A)  # (28), Δ for a finite time
         self.a[rows] = self.a[rows].dot(D[:3, :3].T) + d  # (28), δ_i
 
-    def correct_velocities(self, D: FloatArray, change: FloatArray) -> None:
-        """Turn the landmarks' velocities by D (4, 4), and add ``change`` (n, 3), m/s."""
-        self.u[...] = se3.rotate(D, self.u) + change
-        self.have_moved = True
+    def correct_velocities(
+        self, D: FloatArray, rows: IntArray | slice, change: FloatArray
+    ) -> None:
+        """Turn the velocities of landmarks by D (4, 4), and add ``change`` (m, 3), m/s."""
+        self.u[rows] = se3.rotate(D, self.u[rows]) + change
+        self.have_moved = self.have_moved or len(change) > 0
 
     def add_landmarks(self, points: FloatArray) -> None:
         """Append landmarks where they are seen: y_i° = Â y_i for ``points`` y_i (m, 3)."""

@@ -78,9 +78,9 @@ class LandmarkOrientations(LandmarkColumns):
         """Let landmarks have no orientation."""
         self.B[rows] = 0.0
 
-    def turn(self, omega: FloatArray) -> None:
-        """Turn all of them, B̂_i ← exp(ω_i) B̂_i, by rotation vectors (n, 3)."""
-        self.B[...] = so3.exp(omega) @ self.B
+    def turn(self, rows: IntArray | slice, omega: FloatArray) -> None:
+        """Turn some of them, B̂_i ← exp(ω_i) B̂_i, by rotation vectors (m, 3)."""
+        self.B[rows] = so3.exp(omega) @ self.B[rows]
 
     def count(self, rows: IntArray, accepted: BoolArray) -> None:
         """Count which orientations (m,) were accepted; all others were rejected."""

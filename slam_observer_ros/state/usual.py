@@ -82,7 +82,7 @@ def advance(
 
 def observe(state: State, event: ObservationEvent) -> Outcome | None:
     """Let a state use an observation (28)–(31) made at its instant."""
-    if not 0 < len(event.ids) <= AT_ONCE or not len(state.landmarks):
+    if not 0 < len(event.ids) <= AT_ONCE or not len(state.landmarks.ids):
         return None
     x, seen = _estimate(state), _seen(state, event)
     if x is None or seen is None:
@@ -134,7 +134,9 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
 def _estimate(state: State) -> Estimate | None:
     """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
     joint, observer, calibration = state.filter.joint, state.observer, state.filter.calibration
-    if type(joint) is not JointCovariance or observer.have_moved:
+    if type(joint) is not JointCovariance or joint.chart.stride > state.axes.point:
+        return None
+    if observer.have_moved:
         return None
     return Estimate(
         observer.A,
@@ -156,16 +158,16 @@ def _seen(state: State, event: ObservationEvent) -> Seen | None:
         return None
     if event.sensed is not None:  # late, and carried forward
         return None
-    arms, covariances, calibration = (
-        event.lines_of_sight,
-        event.covariances,
-        state.filter.calibration,
-    )
-    sensor = calibration.sensors.get(event.sensor_frame)
-    if not calibration.corrects_points:
-        return Seen(event.stamp_ns, event.ids, arms, event.sensor, covariances, None, _NO_IDS, 0)
-    if sensor is None:
-        return None
+    arms, covariances = _plain(event.lines_of_sight), event.covariances
+    ids, origins = np.ascontiguousarray(event.ids, np.int64), event.sensor
+    calibration = state.filter.calibration
+    values, estimated, column = None, _NO_IDS, 0
+    if calibration.corrects_points:
+        sensor = calibration.sensors.get(event.sensor_frame)
+        if sensor is None:  # seen for the first time
+            return None
+        values, estimated = sensor.values, sensor.estimated
+        column = calibration.columns(sensor).start
     if state.settings.range_is_depth:
         cosines = sensing.cosines(arms, event.sensor_axis)
         arms = arms / cosines[:, None]
@@ -173,14 +175,19 @@ def _seen(state: State, event: ObservationEvent) -> Seen | None:
             covariances = covariances / cosines[:, None, None] ** 2
     return Seen(
         event.stamp_ns,
-        event.ids,
+        ids,
         arms,
-        event.sensor,
-        covariances,
-        sensor.values,
-        sensor.estimated,
-        calibration.columns(sensor).start,
+        None if origins is None else _plain(origins),
+        None if covariances is None else _plain(covariances),
+        values,
+        estimated,
+        column,
     )
+
+
+def _plain(array: FloatArray) -> FloatArray:
+    """Return an array that may be of another precision or order as C has it."""
+    return np.ascontiguousarray(array, np.float64)
 
 
 def _record(

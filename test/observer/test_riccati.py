@@ -101,7 +101,7 @@ def test_residual_of_any_error_is_linear_but_for_the_left_jacobian(rng):
 @given(generators())
 def test_the_gauge_is_exactly_in_the_null_space_of_the_output_matrix(rng):
     riccati, n = started(rng), 4
-    truth, G = riccati.observer, riccati.joint.gauge(n)
+    truth, G = riccati.observer, riccati.joint.chart.gauge(n)
     everything_moved = G @ rng.normal(size=6)
     np.testing.assert_allclose(residual_after(truth, everything_moved), 0.0, atol=1e-12)
     rows = np.sort(rng.permutation(n)[: rng.integers(1, n + 1)])

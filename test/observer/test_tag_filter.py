@@ -52,7 +52,7 @@ def predicted_orientations(tags, rows):
 def test_output_matrix_of_orientations_is_constant_and_the_gauge_in_its_null_space(settings, rng):
     tags, n = tag_filter(rng, settings=settings), 3
     q, p, k = tags.axes.turn, tags.axes.p, tags.axes.point
-    G = tags.joint.gauge(n)
+    G = tags.joint.chart.gauge(n)
     tags.joint.P = np.eye(len(tags.joint.P))
     H, _ = tags.joint.project_turns(np.arange(n))
     expected = np.zeros((n, q, p + n * (k + q)))
@@ -118,7 +118,7 @@ def test_no_orientation_tells_where_the_worlds_frame_is(rng):
 
     def covariance(is_frame_unsure):
         tags = tag_filter(np.random.default_rng(seed))
-        GG = tags.joint.gauge(3) @ tags.joint.gauge(3).T
+        GG = tags.joint.chart.gauge(3) @ tags.joint.chart.gauge(3).T
         tags.joint.P += is_frame_unsure * GG
         for _ in range(5):
             tags.correct_by_orientations(seen(rows, predicted_orientations(tags, rows), 0.05))

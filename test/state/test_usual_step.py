@@ -134,3 +134,19 @@ def test_a_usual_step_is_the_general_one_to_rounding(worlds, monkeypatch, name):
             break
     assert both.usual >= USUAL_SHARE * both.observed
     assert both.moved >= USUAL_SHARE * both.observed
+
+
+def test_points_of_any_precision_and_order_are_taken(worlds):
+    """As the checks let them pass, from whatever library they come."""
+    world = worlds.load('simulated loop, wheeled')
+    poses = []
+    for make in (lambda array: array, lambda array: np.asfortranarray(array.astype(np.float32))):
+        estimator = Estimator(world.settings)
+        for event in world.events[:600]:
+            if isinstance(event, ObservationEvent):
+                ids = np.repeat(event.ids.astype(np.int32), 2)[::2]
+                points, stated = make(event.points), make(event.covariances)
+                event = replace(event, ids=ids, points=points, covariances=stated)
+            assert estimator.add(event)
+        poses.append(estimator.pose)
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-4)

@@ -21,8 +21,9 @@ from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose, with_blocks
+from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance, sheared
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.outside_landmarks import OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix

@@ -19,23 +19,25 @@ from typing import ClassVar, TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3, slam_group
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     mahalanobis,
     solve_symmetric,
     with_blocks,
 )
+from slam_observer_ros.observer.chart import Chart
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CompressedCovariance,
 )
-from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
-from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
+from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.robust import observation_weights
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -63,14 +65,19 @@ class RiccatiFilter(Filter):
     has_joint_covariance: ClassVar[bool] = True
     ignores = OF_CONSTANT_GAINS
     block = BlockSize()  # of large maps
+    estimates_orientations: ClassVar[bool] = False
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        error, matrix = settings.landmark_velocity_stddev, self.observer.covariance
-        self.joint = (
-            MovingLandmarksCovariance(self.axes, self.calibration, matrix, error)
-            if error > 0.0
-            else JointCovariance(self.axes, self.calibration, matrix)
+        # What is estimated of each landmark beside its position, and how little is known of it.
+        turn = self.axes.turn if self.estimates_orientations else 0
+        velocity = self.axes.point if settings.landmark_velocity_stddev > 0.0 else 0
+        unknown = [UNKNOWN_RAD] * turn + [settings.landmark_velocity_stddev] * velocity
+        self.joint = JointCovariance(
+            Chart(self.axes, self.calibration.count, turn, velocity),
+            self.observer.covariance,
+            self.calibration.initial_covariance(),
+            np.array(unknown) ** 2,
         )
 
     def copy(self) -> Self:
@@ -196,7 +203,7 @@ class RiccatiFilter(Filter):
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact; P is that of pose and calibration from now on."""
         super().fix_landmarks(y_ref, covariances)
-        self.joint = ExactMapCovariance(self.axes, self.joint, covariances)
+        self.joint = ExactMapCovariance(self.joint, covariances)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
@@ -206,15 +213,14 @@ class RiccatiFilter(Filter):
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
-        # A motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v (G), and the positions
-        # of the known landmarks by J γ.
+        # A motion exp(γ) of everything changes x by G γ, and the positions of the known landmarks
+        # by J γ.
         self.joint = joint = self.joint.dense()
         k = self.axes.point
-        G = joint.gauge(len(self.observer.y_ref))
+        G = joint.chart.gauge(len(self.observer))
         J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
-        to_position = -self.axes.turn_matrix(self.observer.points[rows])
-        HP, HPH = joint.project(to_position, rows)  # of −ã_i
+        HP, HPH = joint.project(joint.chart.still(self.observer.points[rows]), rows)  # of −ã_i
         R = block_diagonal(covariances[:, :k, :k])
         x, joint.P = anchor(joint.P, G, -HP.T, HPH + R, J, r[:, :k].ravel())
         self._move(-x)
@@ -228,15 +234,18 @@ class RiccatiFilter(Filter):
             super().enter_map(rows, known)
             return
         # The map beside the estimate, whose gauge γ does not move it, …
-        n, m = len(self.observer.y_ref), len(rows)
+        n, m = len(self.observer), len(rows)
         own = self.points[rows]
         self.add_known(known)
         self.joint = joint = self.joint.dense()
         added = n + np.arange(len(known))
         copies = added[:m]
-        G = joint.gauge(n) + joint.at_rest(added, known.points)
+        chart, size = joint.chart, len(self.observer)
+        G = chart.gauge(size)
+        G[chart.of_landmarks(added)] = 0.0
+        G += chart.at_rest(size, added, known.points)
         # … and landmarks that both have are the same.
-        H = joint.difference(rows, copies, own, known.points[:m])
+        H = chart.difference(size, rows, copies, own, known.points[:m])
         PH, r = joint.P @ H.T, (own - known.points[:m])[:, : self.axes.point].ravel()
         x, joint.P = anchor(joint.P, G, PH, H @ PH, H @ G, r)
         self._move(-x)
@@ -256,7 +265,7 @@ class RiccatiFilter(Filter):
         # At the end of a loop the map may turn so far that it has to be linearised again.
         for _ in range(MERGER_ROUNDS):
             own, other = np.split(self._moved_points(both, -x), [m])
-            H = joint.difference(rows, copies, own, other)
+            H = joint.chart.difference(len(self.observer), rows, copies, own, other)
             HP, r = H @ joint.P, (own - other)[:, : self.axes.point].ravel() + H @ x
             S = HP @ H.T + SAME_M**2 * np.eye(len(r))
             weighted = solve_symmetric(S, r)
@@ -271,8 +280,8 @@ class RiccatiFilter(Filter):
 
     def _moved_points(self, rows: IntArray, x: FloatArray) -> FloatArray:
         """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
-        X = slam_group.exp(self.axes.full_pose(x[: self.axes.p]), self.joint.split(x)[0][rows])
-        return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a)
+        X = self.joint.chart.step(x).X
+        return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a[rows])
 
     def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
         """Merge those of landmarks ``rows`` (m,) with the map's, which are at ``copies``."""
@@ -327,13 +336,11 @@ class RiccatiFilter(Filter):
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
-        """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
-        p, first, observer = self.axes.p, self.joint.first, self.observer
-        self.calibration.shift(x[p:first])
-        xi, u = self.joint.split(x)
-        X = slam_group.exp(self.axes.full_pose(x[:p]), xi)
-        moved = self.joint.active  # none in an exact map
+        """Move the state by exp(x)."""
+        step, observer = self.joint.chart.step(x), self.observer
+        self.calibration.shift(step.calibration)
+        X, moved = step.X, self.joint.active  # none in an exact map
         turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
         observer.correct(X.A, moved, X.a + turned)
-        if u is not None:
-            observer.correct_velocities(X.A, u)
+        if step.velocities is not None:
+            observer.correct_velocities(X.A, moved, step.velocities)

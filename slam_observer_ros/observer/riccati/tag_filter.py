@@ -1,14 +1,14 @@
 """The Riccati filter for landmarks that may have orientations, as tags do.
 
 The orientations seen correct it by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the coordinates of
-:mod:`.tag_covariance` that is H x with a constant H, too. Then the points do, as ever. Both noises
+:mod:`.chart` that is H x with a constant H, too. Then the points do, as ever. Both noises
 are taken to be independent, so to first order that is the same as both at once. Covariances
 (m, 3, 3) are those of rotation vectors, rad².
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from slam_observer_ros.observer.orientations import (
     SeenOrientations,
 )
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
-from slam_observer_ros.observer.riccati.tag_covariance import ExactTagMapCovariance, TagCovariance
 from slam_observer_ros.observer.robust import distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -35,11 +34,10 @@ class RiccatiTagFilter(RiccatiFilter):
     """Gains from the full covariance of pose, calibration, landmarks and their orientations."""
 
     orientations: LandmarkOrientations
-    joint: TagCovariance
+    estimates_orientations: ClassVar[bool] = True
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        self.joint = TagCovariance(self.axes, self.calibration, self.observer.covariance)
         self.orientations = LandmarkOrientations()
         self._is_exact = False  # the map
 
@@ -198,9 +196,7 @@ class RiccatiTagFilter(RiccatiFilter):
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact, and their orientations."""
-        joint = ExactTagMapCovariance(self.axes, self.joint, covariances)
         super().fix_landmarks(y_ref, covariances)
-        self.joint = joint
         self._is_exact = True
         self.orientations = LandmarkOrientations()  # until the map says what they are
         self.orientations.append_zeros(len(y_ref))
@@ -208,5 +204,6 @@ class RiccatiTagFilter(RiccatiFilter):
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x), and the orientations: B̂_i ← exp(ω_i) B̂_i."""
         super()._move(x)
-        if not self._is_exact:
-            self.orientations.turn(self.joint.turns(x))
+        turns = self.joint.chart.step(x).turns
+        if turns is not None:
+            self.orientations.turn(self.joint.active, turns)
