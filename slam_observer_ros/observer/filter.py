@@ -52,13 +52,15 @@ class Filter:
     joint: JointCovariance | None = None
     has_joint_covariance: ClassVar[bool] = False
     ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect on the filter
-    # Those of tags, where they are estimated; else only their positions are used.
-    orientations: LandmarkOrientations | None = None
+    # Whether orientations of tags are; else only their positions are used.
+    estimates_orientations: bool = False
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
         self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
+        self.orientations = LandmarkOrientations()  # of its landmarks, none where not estimated
+        self.is_exact = False  # the map: no landmark is moved
         estimated = settings if self.has_joint_covariance else without_sensor_calibration(settings)
         self.calibration = Calibration(estimated, self.axes)  # of velocities and sensors
         self.motion_noise = MotionNoise(settings)
@@ -67,7 +69,7 @@ class Filter:
         """Return an independent copy."""
         other = copy(self)
         other.observer = self.observer.copy()
-        other.calibration = self.calibration.copy()
+        other.orientations, other.calibration = self.orientations.copy(), self.calibration.copy()
         other.motion_noise = self.motion_noise.copy()
         return other
 
@@ -117,9 +119,8 @@ class Filter:
         """Take over orientations of which nothing is known yet, as they are seen."""
         raise NotImplementedError
 
-    def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
-        """Take in a map's orientations (m, 3, 3), reference frame, with ``sigmas`` (m,), rad."""
-        raise NotImplementedError
+    def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
+        """Take in what a map knows of the orientations of landmarks ``rows`` (m,), if it can."""
 
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
         """Return the standard deviations (m,) of orientations, rad."""
@@ -136,10 +137,13 @@ class Filter:
     ) -> None:
         """Append landmarks seen for the first time at ``points``."""
         self.observer.add_landmarks(points)
+        self.orientations.append_zeros(len(points))
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks that a map knows, reference frame; their errors may be correlated."""
         self.observer.add_reference_landmarks(known.points)
+        rows = self.orientations.append_zeros(len(known))
+        self.take_orientations(rows, known)
 
     def relocate(
         self,
@@ -150,14 +154,19 @@ class Filter:
     ) -> None:
         """Take landmarks for new ones, seen for the first time at ``points``."""
         self.observer.relocate_landmarks(rows, points)
+        self.orientations.clear(rows)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``; those behind move up."""
         self.observer.remove_landmarks(rows)
+        self.orientations.delete(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact and at rest at ``y_ref`` (n, 3), and never move them."""
         self.observer.fix_landmarks(y_ref)
+        self.is_exact = True
+        self.orientations = LandmarkOrientations()  # until the map says what they are
+        self.orientations.append_zeros(len(y_ref))
 
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
@@ -193,6 +202,7 @@ class Filter:
         self.anchor(rows, r, of_rows.covariances)
         self.observer.set_reference(self.observer.points)
         self.add_known(others)
+        self.take_orientations(rows, of_rows)
 
     # What is known of the errors
 

@@ -30,7 +30,6 @@ from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
-from slam_observer_ros.observer.riccati.tag_filter import RiccatiTagFilter
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -435,7 +434,7 @@ class TestTags:
     @given(generators())
     def test_a_map_is_entered_as_by_a_kalman_filter_of_all_errors_together(self, two_d_mode, rng):
         settings = replace(PLAIN, use_tag_orientation=True, two_d_mode=two_d_mode)
-        filter_ = mapped(rng, settings, n=6, design=RiccatiTagFilter)
+        filter_ = mapped(rng, settings, n=6, design=RiccatiFilter)
         see_tags(rng, filter_, np.array([0, 1, 3]))
         # Of 3 both know how it is turned, of 0 and 1 the estimate alone, of 5 the map alone.
         rows, known = np.array([3, 1, 5, 0]), known_by_a_tag_map(rng, filter_)

@@ -27,7 +27,7 @@ from slam_observer_ros.geometry.matrices import (
     with_blocks,
 )
 from slam_observer_ros.observer.chart import Chart
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
+from slam_observer_ros.observer.filter import OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
@@ -38,6 +38,7 @@ from slam_observer_ros.observer.riccati.compressed_covariance import (
 )
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.observer.robust import observation_weights
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -58,21 +59,23 @@ a thing have quite the same centre.
 """
 
 
-class RiccatiFilter(Filter):
+class RiccatiFilter(OrientationGains):
     """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
 
     joint: JointCovariance
     has_joint_covariance: ClassVar[bool] = True
     ignores = OF_CONSTANT_GAINS
     block = BlockSize()  # of large maps
-    estimates_orientations: ClassVar[bool] = False
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        # What is estimated of each landmark beside its position, and how little is known of it.
+        # What is estimated of each landmark beside its position, and how little is known of it:
+        # its velocity, or the orientation of a tag at rest.
+        speed = settings.landmark_velocity_stddev
+        self.estimates_orientations = settings.use_tag_orientation and not speed
+        velocity = self.axes.point if speed else 0
         turn = self.axes.turn if self.estimates_orientations else 0
-        velocity = self.axes.point if settings.landmark_velocity_stddev > 0.0 else 0
-        unknown = [UNKNOWN_RAD] * turn + [settings.landmark_velocity_stddev] * velocity
+        unknown = [UNKNOWN_RAD] * turn + [speed] * velocity
         self.joint = JointCovariance(
             Chart(self.axes, self.calibration.count, turn, velocity),
             self.observer.covariance,
@@ -283,9 +286,6 @@ class RiccatiFilter(Filter):
         X = self.joint.chart.step(x).X
         return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a[rows])
 
-    def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
-        """Merge those of landmarks ``rows`` (m,) with the map's, which are at ``copies``."""
-
     @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
@@ -332,11 +332,10 @@ class RiccatiFilter(Filter):
         """Go on with a covariance for many landmarks, unless they move or have orientations."""
         is_large = len(self.observer.y_ref) + added > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        if self.joint.is_dense and is_large and not may_move and self.orientations is None:
+        if self.joint.is_dense and is_large and not may_move and not self.estimates_orientations:
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
-        """Move the state by exp(x)."""
         step, observer = self.joint.chart.step(x), self.observer
         self.calibration.shift(step.calibration)
         X, moved = step.X, self.joint.active  # none in an exact map
@@ -344,3 +343,5 @@ class RiccatiFilter(Filter):
         observer.correct(X.A, moved, X.a + turned)
         if step.velocities is not None:
             observer.correct_velocities(X.A, moved, step.velocities)
+        if step.turns is not None:
+            self.orientations.turn(moved, step.turns)
