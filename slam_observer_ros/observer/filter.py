@@ -21,7 +21,7 @@ from slam_observer_ros.observer.configuration import turned_moment
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration, without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion, Passage
@@ -80,26 +80,16 @@ class Filter:
         self.observer.propagate(motion.path)
         self.observer.move_landmarks(motion.duration_s)
 
-    def residuals(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        dt_s: FloatArray,
-        D: FloatArray | None = None,
-    ) -> Residuals:
-        """Return what landmarks ``rows`` (m,) seen at ``points`` (m, 3) say against X̂ (29).
+    def residuals(self, rows: IntArray, seen: SeenPoints, dt_s: FloatArray) -> Residuals:
+        """Return what landmarks ``rows`` (m,) say against X̂ (29).
 
-        Points and their ``covariances`` (m, 3, 3) are in the body frame, m and m²; ``dt_s`` (m,)
-        is the time since each was last seen, and D (m, 3, c) how points change with the
-        calibration, reference frame, None where they don't.
+        ``dt_s`` (m,) is the time since each was last seen.
         """
         # A filter that postpones moves of landmarks has made them for :meth:`expected_points`.
-        observer, joint = self.observer, self.joint
-        if joint is not None and not joint.is_dense:
-            joint.activate(rows)
-        e, r = observer.errors(rows, points)
-        return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s, D)
+        observer = self.observer
+        e, r = observer.errors(rows, seen.points)
+        R = observer.turned(seen.covariances)
+        return Residuals(rows, e, r, observer.a[rows], R, dt_s, seen.D)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
@@ -130,14 +120,12 @@ class Filter:
         """Let the calibration of the sensor of another frame be part of the state."""
         self.calibration.add_sensor(frame)
 
-    # Landmarks; D is as of residuals
+    # Landmarks
 
-    def add(
-        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
-    ) -> None:
-        """Append landmarks seen for the first time at ``points``."""
-        self.observer.add_landmarks(points)
-        self.orientations.append_zeros(len(points))
+    def add(self, seen: SeenPoints) -> None:
+        """Append landmarks seen for the first time."""
+        self.observer.add_landmarks(seen.points)
+        self.orientations.append_zeros(len(seen.points))
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks that a map knows, reference frame; their errors may be correlated."""
@@ -145,15 +133,9 @@ class Filter:
         rows = self.orientations.append_zeros(len(known))
         self.take_orientations(rows, known)
 
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
-        """Take landmarks for new ones, seen for the first time at ``points``."""
-        self.observer.relocate_landmarks(rows, points)
+    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
+        """Take landmarks for new ones, seen for the first time."""
+        self.observer.relocate_landmarks(rows, seen.points)
         self.orientations.clear(rows)
 
     def remove(self, rows: IntArray) -> None:

@@ -13,6 +13,7 @@ from strategies import generators
 
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CHECK_INTERVAL,
@@ -97,7 +98,7 @@ class World:
                 rows = np.array([self.ids.index(i) for i in known])
                 observe(filter_, rows, y, R[: len(known)])
             if len(new):
-                filter_.add(y_new, R[: len(new)])
+                filter_.add(SeenPoints(y_new, R[: len(new)]))
         self.ids += new.tolist()
 
     def remove(self, filters, rows):
@@ -108,7 +109,7 @@ class World:
     def relocate(self, filters, rows):
         y = self.seen(np.array(self.ids)[rows])
         for filter_ in filters:
-            filter_.relocate(rows, y, 0.01 * np.eye(3)[None])
+            filter_.relocate(rows, SeenPoints(y, 0.01 * np.eye(3)[None]))
 
     def drive(self, filters, steps):
         for _ in range(steps):

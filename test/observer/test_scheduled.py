@@ -27,6 +27,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.scheduled.core import CAPACITY
 from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
 from slam_observer_ros.observer.scheduled.scheduled import ScheduledFilter
@@ -94,7 +95,9 @@ def landmarks_about_a_robot(rng, n):
     """Filter that has seen n landmarks twice, on a motion that left it unsure of its pose."""
     scheduled = ScheduledFilter(PLAIN, np.eye(4))
     scheduled.set_pose(np.eye(4), 1e-4 * random_covariances(rng, 1, 6)[0])
-    scheduled.add(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
+    scheduled.add(
+        SeenPoints(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
+    )
     for _ in range(3):
         random_step(scheduled, rng, 1e-4, 1e-2)
     V, Q = rng.normal(size=(1, 6)), 1e-3 * random_covariances(rng, 1, 6)
@@ -205,7 +208,9 @@ def test_landmarks_wait_in_few_groups():
 def test_covariances_stay_positive_over_hours_of_any_noise(point_variance_exponents):
     rng, n = np.random.default_rng(4), 20
     scheduled = ScheduledFilter(PLAIN, np.eye(4))
-    scheduled.add(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
+    scheduled.add(
+        SeenPoints(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
+    )
     steps, dt_s = 4_000, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
     Q = 10.0 ** rng.uniform(-10.0, -2.0, (steps, 1, 6, 1)) * np.eye(6)

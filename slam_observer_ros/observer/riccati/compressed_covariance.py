@@ -121,6 +121,10 @@ class CompressedCovariance(JointCovariance):
             if np.linalg.norm(off, axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
                 self._apply()
 
+    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
+        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
+        return a + self.postponed_shifts(rows)
+
     def postponed_shifts(self, rows: IntArray) -> FloatArray:
         """Return how far the observer has yet to move landmarks (m, 3), metres."""
         # Not done here: those who look at the map must not change the bits of the estimate.

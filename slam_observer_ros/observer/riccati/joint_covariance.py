@@ -129,9 +129,9 @@ class JointCovariance:
         """Return the same with all landmarks in P."""
         return self
 
-    def postponed_shifts(self, rows: IntArray) -> FloatArray:
-        """Return how far landmarks (m, 3) have yet to be moved, metres."""
-        raise NotImplementedError
+    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
+        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
+        return a
 
     # The step
 

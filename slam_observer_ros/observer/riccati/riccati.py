@@ -31,7 +31,7 @@ from slam_observer_ros.observer.filter import OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CompressedCovariance,
@@ -96,6 +96,11 @@ class RiccatiFilter(OrientationGains):
         points = observer.y_ref[active] + observer.a[active]
         self.joint.propagate(motion, points, observer.u[active])
         self.motion_noise.factors.move(motion.noise_by_kind)
+
+    def residuals(self, rows: IntArray, seen: SeenPoints, dt_s: FloatArray) -> Residuals:
+        """Return what landmarks (m,), which are going to correct the state, say against it."""
+        self.joint.activate(rows)
+        return super().residuals(rows, seen, dt_s)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
@@ -165,14 +170,12 @@ class RiccatiFilter(OrientationGains):
             self.joint.add_calibration(sensor.variances)
             self._compress_if_large(0)
 
-    def add(
-        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
-    ) -> None:
-        """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
-        self._compress_if_large(len(points))
-        super().add(points, covariances)
+    def add(self, seen: SeenPoints) -> None:
+        """Append landmarks seen for the first time."""
+        self._compress_if_large(len(seen.points))
+        super().add(seen)
         self.motion_noise.factors.forget_motion()  # until now, which is none of theirs
-        self.joint.add_seen(self.observer.turned(covariances), D)
+        self.joint.add_seen(self.observer.turned(seen.covariances), seen.D)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks whose errors are independent of all else, or only of all others."""
@@ -186,17 +189,11 @@ class RiccatiFilter(OrientationGains):
         super().add_known(known)
         self._compress_if_large(0)
 
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
+    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
         self.joint.activate(rows)
-        super().relocate(rows, points, covariances)
-        self.joint.relocate(rows, self.observer.turned(covariances), D)
+        super().relocate(rows, seen)
+        self.joint.relocate(rows, self.observer.turned(seen.covariances), seen.D)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
@@ -310,23 +307,18 @@ class RiccatiFilter(OrientationGains):
     @property
     def points(self) -> FloatArray:
         """(n, 3) estimated landmarks, reference frame, metres."""
-        points = self.observer.points
-        if not self.joint.is_dense:
-            points += self.joint.postponed_shifts(np.arange(len(points)))
-        return points
+        observer = self.observer
+        return observer.y_ref + self.joint.followed(np.arange(len(observer)), observer.a)
 
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
-        if self.joint.is_dense:
-            return super().expected_points(rows)
         observer = self.observer
-        points = observer.y_ref[rows] + self.translations(rows)
-        return observer.in_body_frame(points)
+        y_ref, a = (of.take(rows, axis=0, mode='wrap') for of in (observer.y_ref, observer.a))
+        return observer.in_body_frame(y_ref + self.joint.followed(rows, a))
 
     def translations(self, rows: IntArray) -> FloatArray:
         """Return â_i (m, 3) of landmarks, metres."""
-        a = super().translations(rows)
-        return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
+        return self.joint.followed(rows, super().translations(rows))
 
     def _compress_if_large(self, added: int) -> None:
         """Go on with a covariance for many landmarks, unless they move or have orientations."""
