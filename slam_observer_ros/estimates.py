@@ -142,4 +142,6 @@ class Smoothed:
     since: str
     slips: int
     # (n, 3, 3) of the landmarks, world, zero where unknown; None if it is not estimated
-    orientations: FloatArray | None = None
+    orientations: FloatArray | None
+    calibration: list[CalibrationEstimate]  # c, of the last pose if it drifts
+    calibration_correlations: FloatArray  # (c, c)

@@ -18,6 +18,7 @@ from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.observer import core
+from slam_observer_ros.settings.message_types import message_types
 
 LISTENER = 'slam_observer_ros.nodes.live_inputs'
 """The program that hears topics; it is one of its own, as only ``nodes/`` knows ROS."""
@@ -25,12 +26,8 @@ LISTENER = 'slam_observer_ros.nodes.live_inputs'
 PATIENCE_S = 20.0
 """Time for that to start and to end, beyond the time of listening."""
 
-MESSAGE_PACKAGES = {
-    'tf2_msgs': 'poses of sensors on /tf',
-    'vision_msgs': 'Detection3DArray',
-    'apriltag_msgs': 'AprilTagDetectionArray',
-    'aruco_opencv_msgs': 'ArucoDetection',
-}
+COMMON_PACKAGES = ('geometry_msgs', 'nav_msgs', 'sensor_msgs')
+"""Packages of messages that every ROS has."""
 
 OPTIONAL_PACKAGES = {
     'rosbags': 'recordings',
@@ -94,7 +91,7 @@ def _installed() -> dict[str, str]:
         'ROS': _ros(),
         'step of the filter': core.description(),
     }
-    for package, use in MESSAGE_PACKAGES.items():
+    for package, use in _message_packages().items():
         found[package] = _presence(find_spec(package) is not None, use)
     for package, use in OPTIONAL_PACKAGES.items():
         try:
@@ -102,6 +99,16 @@ def _installed() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[package] = _presence(False, use)
     return found
+
+
+def _message_packages() -> dict[str, str]:
+    """Return the packages of messages that may be missing, and what they are for."""
+    packages = {'tf2_msgs': 'poses of sensors on /tf'}
+    for known in (*message_types('velocity').values(), *message_types('landmarks').values()):
+        package = known.name.partition('/')[0]
+        if package not in COMMON_PACKAGES:
+            packages[package] = known.short_name
+    return packages
 
 
 def _presence(is_there: bool, use: str) -> str:

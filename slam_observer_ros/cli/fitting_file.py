@@ -9,7 +9,8 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.messages.message_types import APRILTAGS, TRANSFORMS
+from slam_observer_ros.messages.detections import APRILTAGS
+from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.recording.reader import Recording
 
 MOST_EVENTS = 20_000

@@ -40,6 +40,7 @@ COMMANDS = {
     'convert': ('convert', 'make a recording of a public data set'),
     'map': ('map', 'make a map file of a map of another program, or check one'),
     'replay': ('replay.command', 'run a recording through the observer'),
+    'calibrate': ('calibrate.command', 'find how sensor and odometry err, by a drive'),
     'tune': ('tune.command', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),
     'doctor': ('doctor', 'say what is installed, and what a node would hear'),

@@ -133,7 +133,7 @@ KINDS = {
     'late_odometry': Kind(
         Level.WARNING,
         'the odometry takes effect {delay_s:.2f} s {when}',
-        'mind it in the driver (Tune the noise)',
+        'mind it in the driver, or set velocity_delay: {set_to:.2f} (Tune the noise)',
     ),
     'implausible_calibration': Kind(
         Level.WARNING,
@@ -321,6 +321,11 @@ KINDS = {
         Level.WARNING,
         'landmarks {ids} have moved',
         'if they have not, state more noise, or look at odometry and ids',
+    ),
+    'carried_landmark': Kind(
+        Level.WARNING,
+        'landmarks {ids} move with the robot, and are not used',
+        'nothing is wrong if it carries them; where they stay behind they are used again',
     ),
     'many_moved': Kind(
         Level.WARNING,

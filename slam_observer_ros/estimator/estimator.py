@@ -294,10 +294,10 @@ class Estimator:
         made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
         (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
         had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
-        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, ``'merged_landmark'``,
-        ``'doubled_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
-        ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
+        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'carried_landmark'``,
+        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``,
+        ``'merged_landmark'``, ``'doubled_landmark'``) and points not used (``'unknown_id'``,
+        ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
@@ -678,6 +678,8 @@ class Estimator:
             warnings.warn('more_than_max', count=len(event.ids), limit=limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
+        if carried_ids := self._hypotheses.carried_ids:
+            warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import logging
 from os.path import commonpath
 
-from slam_observer_ros.messages.message_types import TRANSFORMS
+from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.recording.sources import last_part, Topic
 
 logger = logging.getLogger(__name__)

@@ -135,9 +135,9 @@ def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
     parts = list(calibration)
     for part in parts:
         notable_s = max(NOTABLE_DELAY_S, CERTAIN * part.deviation)
-        if part.name == DELAY_NAME and abs(part.value) > notable_s:
+        if part.name == DELAY_NAME and abs(part.value - part.nominal) > notable_s:
             when = 'late' if part.value > 0.0 else 'early'
-            return [found('late_odometry', delay_s=abs(part.value), when=when)]
+            return [found('late_odometry', delay_s=abs(part.value), when=when, set_to=part.value)]
     return [_implausible(part) for part in parts if _times_off(part) > IMPLAUSIBLE]
 
 

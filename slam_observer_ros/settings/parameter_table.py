@@ -6,7 +6,7 @@ parameter descriptors, the check of YAML files, the command-line options and the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 import dataclasses
 from dataclasses import dataclass
 import difflib
@@ -146,11 +146,14 @@ def parameter(
     unit: str = '',
     minimum: float = -math.inf,
     maximum: float = math.inf,
-    choices: tuple[str, ...] = (),
+    choices: tuple[str, ...] | Callable[[], tuple[str, ...]] = (),
     read_only: bool = True,
     basic: bool = False,
 ) -> Any:
-    """Return a dataclass field that is a row of the table: a :class:`Parameter` of its name."""
+    """Return a dataclass field that is a row of the table: a :class:`Parameter` of its name.
+
+    ``choices`` may be a function, if they are not known before all modules are there.
+    """
     row = {
         'description': description,
         'unit': unit,
@@ -165,10 +168,14 @@ def parameter(
 
 def table(settings_class: type[Dataclass]) -> tuple[Parameter, ...]:
     """Return the parameter table of a settings dataclass, in the order of its fields."""
-    return tuple(
-        Parameter(name=field.name, default=cast('Value', field.default), **field.metadata)
-        for field in dataclasses.fields(settings_class)
-    )
+    return tuple(map(_row, dataclasses.fields(settings_class)))
+
+
+def _row(field: dataclasses.Field[Any]) -> Parameter:
+    row = dict(field.metadata)
+    if callable(row['choices']):
+        row['choices'] = row['choices']()
+    return Parameter(name=field.name, default=cast('Value', field.default), **row)
 
 
 def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object]) -> SettingsT:

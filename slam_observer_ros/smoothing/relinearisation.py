@@ -197,10 +197,10 @@ class Relinearisation:
             self.history.summarise(self._known().least_nonlinear(self._axes)[0])
             self._clear_counts()
 
-    def smooth(self) -> tuple[Solution, int]:
-        """Return all smoothed estimates, and how many slips they confirm (:mod:`.slips`).
+    def smooth(self) -> tuple[Step, int]:
+        """Return the last step of smoothing, and how many slips it confirms (:mod:`.slips`).
 
-        They are iterated from the present ones, which stay as they are. Raise
+        Its estimates are iterated from the present ones, which stay as they are. Raise
         :exc:`ParameterError` if what the smoother takes for constant is not, or no history is
         kept, :exc:`SmoothingError` if the observations don't determine everything.
         """
@@ -213,7 +213,7 @@ class Relinearisation:
                 'covariances that say they are exact'
             ) from error
 
-    def _smoothed(self) -> tuple[Solution, int]:
+    def _smoothed(self) -> tuple[Step, int]:
         prior, keyframes = self.history.prior, self.history.keyframes()
         start, slips = self._solution_from(0), 0
 
@@ -229,8 +229,7 @@ class Relinearisation:
             keyframes, slips = keyframes.with_slips(are_slips), int(np.sum(are_slips))
         smoother = self._smoother(prior, keyframes)
         start = self._without_outliers_of_then(smoother, start)
-        smoothed = smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE)
-        return smoothed.end, slips
+        return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE), slips
 
     def _check_smoothable(self) -> None:
         if self._settings.relinearization_interval == 0:

@@ -26,7 +26,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher, MANY_UNUSED
@@ -68,7 +68,7 @@ def values_of(status):
 
 
 def ids(maps):
-    return sorted(decode_point_cloud2(serialize_message(maps[-1])).event.ids) if maps else []
+    return sorted(decode_point_cloud2(serialize_message(maps[-1])).ids) if maps else []
 
 
 def test_paused_observer_holds_its_pose_and_counts_what_it_drops(ros, tmp_path):

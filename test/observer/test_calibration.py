@@ -496,3 +496,50 @@ def test_a_bias_that_may_drift_is_plausible_wherever_it_is():
     drifts = replace(GYROSCOPE, angular_bias_stddev=(0.002,) * 3, calibration_drift=1.0)
     estimator = estimate(drive(drifts, 60.0, bias=5.0 * GYROSCOPE_BIAS), drifts)
     assert not of_calibration(estimator.calibration)
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+def test_what_is_stated_of_the_velocity_is_used(gains):
+    scale, bias = np.array([1.1, 0.9, 1.05, 0.95, 1.02, 0.97]), np.full(6, 0.01)
+    stated = Settings(
+        gains=gains,
+        angular_scale=tuple(scale[:3]),
+        linear_scale=tuple(scale[3:]),
+        angular_bias=tuple(bias[:3]),
+        linear_bias=tuple(bias[3:]),
+        velocity_delay=0.15,
+        angular_bias_stddev=NO_BIAS,
+        velocity_delay_stddev=0.0,
+    )
+    world = drive(stated, 10.0, noise=0.0, scale=scale, bias=bias, delay_ns=DELAY_NS)
+    estimator = estimate(world, stated)
+    assert estimator.calibration == []
+    assert configuration_error_m(estimator, world) < 1e-6
+
+
+def test_estimates_begin_at_what_is_stated_of_the_velocity():
+    stated = replace(
+        WHEELS, linear_scale=(1.05, 1.0, 1.0), velocity_delay=0.15, velocity_delay_stddev=0.05
+    )
+    world = drive(stated, 40.0, scale=WHEEL_SCALE, delay_ns=DELAY_NS)
+    estimator = estimate(world, stated)
+    found = {part.name: part for part in estimator.calibration}
+    assert found['linear_scale_x'].nominal == 1.05
+    assert abs(found['linear_scale_x'].value - 1.05) < 3.5 * found['linear_scale_x'].deviation
+    assert abs(found['velocity_delay'].value - 0.15) < 3.5 * found['velocity_delay'].deviation
+    assert of_calibration(estimator.calibration) == []  # a late odometry is made up for
+
+
+def test_smoothing_knows_what_a_calibration_leaves_open():
+    """A filter alone takes a common scale for known: it has linearised at several ones."""
+    open_ = {'range_scale_stddev': 0.1, 'linear_scale_stddev': (0.1, 0.0, 0.0)}
+    settings = replace(WHEELS, angular_scale_stddev=NO_BIAS, smoothing_window=0, **open_)
+    smoothed = estimate(drive(settings, 20.0), settings).smooth()
+    parts = {part.name: part for part in smoothed.calibration}
+    np.testing.assert_allclose(np.diagonal(smoothed.calibration_correlations), 1.0)
+    # Each of them is known no better than both together, and a map is as large as either says.
+    for name in ('linear_scale_x', 'range_scale'):
+        assert parts[name].deviation > 0.9 * 0.1 / math.sqrt(2.0)
+        assert abs(parts[name].value - 1.0) < 3.0 * parts[name].deviation
+    row, column = (list(parts).index(name) for name in ('linear_scale_x', 'range_scale'))
+    assert smoothed.calibration_correlations[row, column] > 0.95

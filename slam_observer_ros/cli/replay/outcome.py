@@ -244,7 +244,7 @@ def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
         smoothed,
         stamps_ns,
         outcome.result.dead_reckoning,
-        outcome.result.estimator.calibration,
+        outcome.result.estimator,
     )
     return replace(
         outcome,

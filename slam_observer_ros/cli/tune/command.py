@@ -17,7 +17,8 @@ from slam_observer_ros.cli.outputs import (
 from slam_observer_ros.cli.replay.request import add_input_options, read_request, ReplayRequest
 from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
 from slam_observer_ros.cli.tune.noise_kinds import kinds_of, NoiseKind, scaled
-from slam_observer_ros.cli.tune.search import Found, most_likely, remembered, without_effect
+from slam_observer_ros.cli.tune.noise_search import search_noise
+from slam_observer_ros.cli.tune.search import Found
 from slam_observer_ros.cli.tune.tuned_file import certainty, rounded, verdict_lines, write_tuned
 from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
 from slam_observer_ros.common.errors import IncompleteError, UsageError
@@ -79,7 +80,12 @@ def run(args: argparse.Namespace) -> None:
     hashes += [material.sha256 for material in trained_on]
     if len(set(hashes)) < len(hashes):
         raise UsageError('a recording is given twice; what is trained on can not be held out, too')
-    kinds, found = _search(trained_on, settings)
+    # What the settings that are tried give reason to warn of is nobody's concern.
+    with muted_warnings(), shown_steps('tuning') as advance:
+        likelihoods = [material.likelihood for material in trained_on]
+        kinds, found = search_noise(likelihoods, settings, kinds_of(settings), advance)
+    if not kinds:
+        raise UsageError('no noise figure has an effect: messages state all covariances')
     tuned = _rounded(scaled(settings, kinds, found.log_factors.tolist()), kinds)
     verdict = _verdict(request, args.hold_out, trained_on, tuned)
     _print(args, settings, tuned, kinds, found, verdict)
@@ -90,28 +96,6 @@ def run(args: argparse.Namespace) -> None:
         held_out = [str(path) for path in args.hold_out] or ['the last third of each']
         trained = [f'{one.path.name} (SHA-256 {one.sha256})' for one in trained_on]
         write_tuned(args.out, given.values, tuned, texts, trained, held_out, verdict)
-
-
-def _search(trained_on: Sequence[Material], settings: Settings) -> tuple[list[NoiseKind], Found]:
-    """Return the kinds of noise that have an effect, and their most likely factors."""
-    # What the settings that are tried give reason to warn of is nobody's concern.
-    with muted_warnings(), shown_steps('tuning') as advance:
-
-        def log_likelihood(kinds: list[NoiseKind], log_factors: Sequence[float]) -> float:
-            advance()
-            tried = scaled(settings, kinds, log_factors)
-            likelihoods = [material.likelihood(tried) for material in trained_on]
-            return sum(one.mean * count for one, count in zip(likelihoods, counts, strict=True))
-
-        counts = [material.likelihood(settings).count for material in trained_on]
-        if not all(counts):
-            raise UsageError('nothing is seen twice in what is trained on')
-        kinds = kinds_of(settings)
-        idle = without_effect(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
-        kinds = [kind for number, kind in enumerate(kinds) if number not in idle]
-        if not kinds:
-            raise UsageError('no noise figure has an effect: messages state all covariances')
-        return kinds, most_likely(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
 
 
 def _rounded(settings: Settings, kinds: Sequence[NoiseKind]) -> Settings:

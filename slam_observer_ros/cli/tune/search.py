@@ -52,6 +52,8 @@ def without_effect(objective: Objective, n: int) -> list[int]:
 
 def most_likely(objective: Objective, n: int) -> Found:
     """Return the maximum of a log likelihood over the logarithms of n factors, from 1 on."""
+    if not n:
+        return Found(np.zeros(0), np.zeros(0), objective(np.zeros(0)))
     simplex = np.vstack([np.zeros(n), FIRST_STEP * np.eye(n)])
     result = optimize.minimize(
         lambda x: -objective(x),

@@ -8,7 +8,8 @@ of x, H x being observed with the covariance S and the residual r, leaves
     cov(η)    = B − X Ψ Xᵀ,    Ψ ← Ψ + (H Φ)ᵀ S⁻¹ H Φ
     η̂         moved by  −X g,    g = (H Φ)ᵀ S⁻¹ r,
 
-whatever η is and however many of them there are. On the group, X̂ ← exp(−K r) · X̂, a landmark's
+whatever η is and however many of them there are. Where some of the η become part of x, X has the
+columns cov(η, η_i) of B, too: Φ and Ψ grow by these. On the group, X̂ ← exp(−K r) · X̂, a landmark's
 shift a since its reference becomes D a − J X_i g, with D = exp(ε_Ω) and its left Jacobian J; over
 many corrections D₁ a + T X_i, with a tensor T. See docs/theory.md, Large maps.
 """
@@ -66,6 +67,14 @@ class PostponedCorrection:
     def extend(self, count: int) -> None:
         """Append entries to x, which do not depend on η so far."""
         self.Phi = np.concatenate([self.Phi, np.zeros((count, self.Phi.shape[1]))])
+
+    def take(self, Phi: FloatArray, variances: FloatArray) -> None:
+        """Append entries to x that were η (m,): rows of Φ, and a column of X for each."""
+        m = len(variances)
+        self.Phi = np.block([[self.Phi, np.zeros((len(self.Phi), m))], [Phi, np.eye(m)]])
+        self.Psi = np.pad(self.Psi, (0, m))
+        self.shift = np.pad(self.shift, ((0, 0), (0, 0), (0, m)))
+        self._deviations = np.append(self._deviations, np.sqrt(np.maximum(variances, 0.0)))
 
     def remove(self, entries: IntArray) -> None:
         """Remove entries of x."""

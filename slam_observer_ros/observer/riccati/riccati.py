@@ -197,8 +197,8 @@ class RiccatiFilter(OrientationGains):
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
-        super().remove(rows)
         self.joint.remove(rows)
+        super().remove(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact; P is that of pose and calibration from now on."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.cloud_fields import (
     CloudField,
     COVARIANCE_NAMES,
@@ -26,7 +26,10 @@ from slam_observer_ros.messages.cloud_fields import (
     UNKNOWN_UINT32_ID,
     VELOCITY_NAMES,
 )
-from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.registry import reads
+
+CLOUDS = ('sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/PointCloud')
+"""Types whose points may have no ids, or be true landmarks."""
 
 MAX_UNKNOWN_POINTS = 500
 """Most points without id in a message: associating them costs their number cubed."""
@@ -40,13 +43,40 @@ Records: TypeAlias = NDArray[np.void]
 """(height, width) structured view of a cloud's data: one record a point."""
 
 
-def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
-    """Decode a sensor_msgs/PointCloud whose ids, if any, are in the channel ``id``.
+@reads(CLOUDS[0], role='landmarks')
+def decode_point_cloud2(reader: CdrReader) -> ObservationEvent:
+    """Read a sensor_msgs/PointCloud2 with fields x, y, z and, if it has them, more.
+
+    ``id`` gives the landmark ids, ``UNKNOWN_ID`` where it holds -1 (2³² - 1 if unsigned) or is
+    missing; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per point in the axes of
+    the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s. Points that weren't
+    measured, which are NaN or infinite, are left out, whatever id they have, and whether or not
+    the cloud claims to be dense.
+    """
+    stamp_ns, frame_id = reader.header()
+    height, width = reader.uint32(), reader.uint32()
+    fields = tuple(read_field(reader) for _ in range(reader.uint32()))
+    byte_order = '>' if reader.uint8() else '<'
+    point_step, row_step = reader.uint32(), reader.uint32()
+    data = reader.data(reader.uint32())
+    reader.uint8()  # is_dense, which many publishers set for clouds that are not.
+    if height * width == 0:
+        no_ids = np.zeros(0, dtype=np.int64)
+        return ObservationEvent(stamp_ns, no_ids, np.zeros((0, 3)), sensor_frame=frame_id)
+    _check_size(len(data), height, width, point_step, row_step)
+    dtype = _record_type(fields, byte_order, point_step)
+    strides = (row_step if height > 1 else len(data), point_step)
+    records: Records = np.ndarray((height, width), dtype, data, strides=strides)
+    return _observation(stamp_ns, frame_id, records)
+
+
+@reads(CLOUDS[1], role='landmarks')
+def decode_point_cloud(reader: CdrReader) -> ObservationEvent:
+    """Read a sensor_msgs/PointCloud whose ids, if any, are in the channel ``id``.
 
     They are ``UNKNOWN_ID`` where the channel holds -1 or is missing, and ``IMPOSSIBLE_ID`` where
     it holds no whole number that float32 holds exactly; a MessageError is raised if none is one.
     """
-    reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     points = reader.float32(3 * reader.uint32()).reshape(-1, 3)
     measured = is_measured(points)
@@ -58,36 +88,7 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[O
             if len(values) != len(points):
                 raise MessageError(f'{len(values)} ids for {len(points)} points')
             ids[measured] = _ids_from_floats(values[measured], FLOAT32_ID_LIMIT)
-    reader.finish()
-    return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points).select(measured))
-
-
-def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
-    """Decode a sensor_msgs/PointCloud2 with fields x, y, z and, if it has them, more.
-
-    ``id`` gives the landmark ids, ``UNKNOWN_ID`` where it holds -1 (2³² - 1 if unsigned) or is
-    missing; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per point in the axes of
-    the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s. Points that weren't
-    measured, which are NaN or infinite, are left out, whatever id they have, and whether or not
-    the cloud claims to be dense.
-    """
-    reader = CdrReader(raw)
-    stamp_ns, frame_id = reader.header()
-    height, width = reader.uint32(), reader.uint32()
-    fields = tuple(read_field(reader) for _ in range(reader.uint32()))
-    byte_order = '>' if reader.uint8() else '<'
-    point_step, row_step = reader.uint32(), reader.uint32()
-    data = reader.data(reader.uint32())
-    reader.uint8()  # is_dense, which many publishers set for clouds that are not.
-    reader.finish()
-    if height * width == 0:
-        nothing = ObservationEvent(stamp_ns, np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-        return Measurement(frame_id, nothing)
-    _check_size(len(data), height, width, point_step, row_step)
-    dtype = _record_type(fields, byte_order, point_step)
-    strides = (row_step if height > 1 else len(data), point_step)
-    records: Records = np.ndarray((height, width), dtype, data, strides=strides)
-    return Measurement(frame_id, _observation(stamp_ns, records))
+    return ObservationEvent(stamp_ns, ids, points, sensor_frame=frame_id).select(measured)
 
 
 def is_measured(points: FloatArray) -> BoolArray:
@@ -160,7 +161,7 @@ def _check_size(size: int, height: int, width: int, point_step: int, row_step: i
         )
 
 
-def _observation(stamp_ns: int, records: Records) -> ObservationEvent:
+def _observation(stamp_ns: int, frame_id: str, records: Records) -> ObservationEvent:
     points = _columns(records, POINT_NAMES)
     measured = is_measured(points)
     if not measured.all():  # The other fields of such points may hold anything.
@@ -172,7 +173,9 @@ def _observation(stamp_ns: int, records: Records) -> ObservationEvent:
             covariances = upper_triangles[:, _UPPER_TRIANGLE_TO_MATRIX].reshape(-1, 3, 3)
     if VELOCITY_NAMES[0] in _names(records):
         velocities = _columns(records, VELOCITY_NAMES)
-    return ObservationEvent(stamp_ns, _ids(records), points, covariances, velocities)
+    return ObservationEvent(
+        stamp_ns, _ids(records), points, covariances, velocities, sensor_frame=frame_id
+    )
 
 
 def _names(records: Records) -> tuple[str, ...]:
