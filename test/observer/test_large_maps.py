@@ -13,11 +13,8 @@ from strategies import generators
 
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-<<<<<<< HEAD
 from slam_observer_ros.observer.residuals import SeenPoints
-=======
 from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
->>>>>>> main
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CHECK_INTERVAL,
