@@ -296,10 +296,10 @@ KINDS = {
     ),
     'large_map': Kind(
         Level.WARNING,
-        'the map has {count} landmarks. Where they move or have orientations, time and memory '
-        'that riccati gains take grow with their square: 70 ms a step and 0.5 GB for 600 tags',
-        'max_landmarks limits them; use_tag_orientation: false takes a step of a large map back '
-        'to that of a small one',
+        'the map has {count} landmarks. Where they move, time and memory that riccati gains take '
+        'grow with their square: 70 ms a step and 0.5 GB for 600 landmarks in space',
+        'max_landmarks limits them; landmark_velocity_stddev: 0.0 is for those at rest, of which '
+        'many cost no more than few',
     ),
     'loaded_map': Kind(
         Level.WARNING,

@@ -76,5 +76,6 @@ def _orientations_of(state: State, rows: IntArray) -> FloatArray | None:
     tags = state.filter.orientations
     if not tags.are_known[rows].any():
         return None
-    world: FloatArray = state.observer.reference_pose[:3, :3] @ tags.B[rows]
+    B = state.filter.orientation_matrices(rows)
+    world: FloatArray = state.observer.reference_pose[:3, :3] @ B
     return world

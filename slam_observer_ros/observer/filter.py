@@ -20,7 +20,7 @@ from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.observer.configuration import turned_moment
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
+from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration, without_sensor_calibration
@@ -59,7 +59,7 @@ class Filter:
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
         self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
-        self.orientations = LandmarkOrientations()  # of its landmarks, none where not estimated
+        self.orientations = self.observer.orientations  # of tags; none where not estimated
         self.is_exact = False  # the map: no landmark is moved
         estimated = settings if self.has_joint_covariance else without_sensor_calibration(settings)
         self.calibration = Calibration(estimated, self.axes)  # of velocities and sensors
@@ -69,7 +69,8 @@ class Filter:
         """Return an independent copy."""
         other = copy(self)
         other.observer = self.observer.copy()
-        other.orientations, other.calibration = self.orientations.copy(), self.calibration.copy()
+        other.orientations = other.observer.orientations
+        other.calibration = self.calibration.copy()
         other.motion_noise = self.motion_noise.copy()
         return other
 
@@ -112,6 +113,11 @@ class Filter:
     def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
         """Take in what a map knows of the orientations of landmarks ``rows`` (m,), if it can."""
 
+    def orientation_matrices(self, rows: IntArray) -> FloatArray:
+        """Return orientations (m, 3, 3), reference frame, zero where none is known."""
+        B: FloatArray = self.orientations.B[rows]
+        return B
+
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
         """Return the standard deviations (m,) of orientations, rad."""
         raise NotImplementedError
@@ -125,30 +131,25 @@ class Filter:
     def add(self, seen: SeenPoints) -> None:
         """Append landmarks seen for the first time."""
         self.observer.add_landmarks(seen.points)
-        self.orientations.append_zeros(len(seen.points))
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks that a map knows, reference frame; their errors may be correlated."""
         self.observer.add_reference_landmarks(known.points)
-        rows = self.orientations.append_zeros(len(known))
-        self.take_orientations(rows, known)
+        n = len(self.observer)
+        self.take_orientations(np.arange(n - len(known), n), known)
 
     def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
         """Take landmarks for new ones, seen for the first time."""
         self.observer.relocate_landmarks(rows, seen.points)
-        self.orientations.clear(rows)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``; those behind move up."""
         self.observer.remove_landmarks(rows)
-        self.orientations.delete(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact and at rest at ``y_ref`` (n, 3), and never move them."""
         self.observer.fix_landmarks(y_ref)
         self.is_exact = True
-        self.orientations = LandmarkOrientations()  # until the map says what they are
-        self.orientations.append_zeros(len(y_ref))
 
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""

@@ -20,7 +20,7 @@ from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry.matrices import symmetric, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import symmetric, transpose
 from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
@@ -77,7 +77,7 @@ class CompressedCovariance(JointCovariance):
         # (n,) where each landmark is outside, −1 for nowhere; and (slots,) which ones are there
         self._slots = np.full(n, -1)
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
-        self._postponed = PostponedCorrection(self.P, self._axes.point)
+        self._postponed = self._nothing_postponed()
         self._corrections, self._most = 0, size.most
         self._changed = 0  # panels, since the last correction
 
@@ -98,19 +98,30 @@ class CompressedCovariance(JointCovariance):
 
     # The step
 
-    def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
-        """Update P and return the error x of pose, calibration and active landmarks."""
-        HP, HPH = self.project(C, rows)
-        postponed, p, q = self._postponed, self._p, C.shape[2]
-        H_Phi = C.reshape(-1, q) @ postponed.Phi[:q] - postponed.Phi[self._columns(rows)]
+    def _project(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P beside H Φ (r, …) and H P Hᵀ (r, r)."""
+        HP, HPH = super()._project(C, columns)
+        Phi = self._postponed.Phi
+        return np.hstack([HP, C @ Phi[: C.shape[1]] - Phi[columns]]), HPH
+
+    def project_own_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same of ω_i."""
+        HP, HPH = super().project_own_turns(rows)
+        return np.hstack([HP, self._postponed.Phi[self._turn_columns(rows)]]), HPH
+
+    def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
+        """Update P by what has been projected; return K r of pose, calibration, active ones."""
+        if not len(r):
+            return np.zeros(len(self.P))
         # L⁻¹ of all that is multiplied by S⁻¹ = L⁻ᵀ L⁻¹.
-        whitened = _whitened(with_blocks(HPH, R), np.column_stack([HP, H_Phi, r.ravel()]))
+        whitened = _whitened(S, np.column_stack([HP, r]))
         W, W_Phi, z = np.split(whitened, [len(self.P), whitened.shape[1] - 1], axis=1)
         self._matrix.subtract_square(W)
-        x: FloatArray = -W.T @ z[:, 0]
-        postponed.correct(W, W_Phi, z[:, 0], self._axes.full_pose(x[:p])[:3])
+        Kr: FloatArray = W.T @ z[:, 0]
+        turn = self._axes.full_pose(-Kr[: self._p])[:3]
+        self._postponed.correct(W, W_Phi, z[:, 0], turn)
         self._work()
-        return x
+        return Kr
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks ``rows`` (m,), of an observation, are active."""
@@ -133,6 +144,9 @@ class CompressedCovariance(JointCovariance):
             if np.linalg.norm(off[are_out], axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
                 self._restart(self.active[:0])
                 return
+            self._turn(number, X)
+        if self.chart.turn:
+            self._forget_gains()
 
     def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
         """Return what â_i (m, 3) of landmarks are with all that is postponed."""
@@ -196,16 +210,54 @@ class CompressedCovariance(JointCovariance):
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
         self._apply()
-        m, k = len(points), self._axes.point
-        slots = self._outside.add_independent(points, covariances[:, :k, :k])
+        m = len(points)
+        slots = self._outside.add_independent(points, self._known_blocks(covariances))
         self._places = np.concatenate([self._places, np.full(m, -1)])
         self._set_slots(np.concatenate([self._slots, slots]))
+
+    def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
+        """Take over orientations (m,) whose errors (m, q, q) are independent of all else."""
+        is_active = self._places[rows] >= 0
+        super().add_known_turns(rows[is_active], covariances[is_active])
+        if not is_active.all():
+            self._apply()
+            slots = self._slots[rows[~is_active]]
+            order, turns = np.argsort(slots), slice(self._axes.point, self._stride)
+            self._outside.set_independent(slots[order], turns, covariances[~is_active][order])
+
+    def own_turns(self, rows: IntArray) -> FloatArray:
+        """Return the covariances (m, q, q) of each ω_i, rad²."""
+        is_active, q = self._places[rows] >= 0, self.chart.turn
+        covariances, at = np.empty((len(rows), q, q)), np.flatnonzero(~is_active)
+        covariances[is_active] = super().own_turns(rows[is_active])
+        at, k, begin = at[np.argsort(self._slots[rows[at]])], self._axes.point, 0
+        for view in self._views(rows[at]):
+            X, mine = view.X[:, k:], at[begin : begin + len(view.rows)]
+            own = view.own[:, k:, k:] - (X @ self._postponed.Psi) @ transpose(X)
+            covariances[mine], begin = own, begin + len(view.rows)
+        return covariances
+
+    def of_landmarks(
+        self, rows: IntArray, points: FloatArray, tags: IntArray
+    ) -> FloatArray | None:
+        """Return the covariance (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,)."""
+        every = np.union1d(rows, tags)
+        at, of_tags = np.searchsorted(every, rows), np.searchsorted(every, tags)
+        return self.marginal(every).of_landmarks(at, points, of_tags)
+
+    def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
+        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
+        every = np.tile(np.eye(3), (len(self._places), 1, 1))
+        for view in self._views(np.unique(rows[self._places[rows] < 0])):
+            every[view.rows] = view.turns
+        turned: FloatArray = every[rows] @ B
+        return turned
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
         self._finish()
         places, slots = self._places[rows], self._slots[rows]
-        columns = JointCovariance._columns(self, places[places >= 0])
+        columns = self.chart.of_landmarks(places[places >= 0])
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
         self._postponed.remove(columns)
         self._outside.remove(slots[slots >= 0])
@@ -240,14 +292,16 @@ class CompressedCovariance(JointCovariance):
         P[:p] = P[:, :p] = 0.0
         P[:p, :p] = covariance
         self.P = sheared(P, self.first, T)
-        self._postponed = PostponedCorrection(self.P, self._axes.point)
+        self._postponed = self._nothing_postponed()
 
     def marginal(self, rows: IntArray) -> JointCovariance:
         """Return the covariance of pose, calibration and different landmarks (m,) alone."""
         is_active = self._places[rows] >= 0
         others = np.flatnonzero(~is_active)
         others = others[np.argsort(self._slots[rows[others]])]
-        local = np.append(np.arange(self.first), self._columns(rows[is_active]))
+        local = np.append(
+            np.arange(self.first), self.chart.of_landmarks(self._places[rows[is_active]])
+        )
         postponed, outside, views = self._postponed, self._outside, self._views(rows[others])
         Phi, b = postponed.Phi[local], postponed.Phi.shape[1]
         X = np.concatenate([np.empty((0, b)), *(view.X.reshape(-1, b) for view in views)])
@@ -259,7 +313,7 @@ class CompressedCovariance(JointCovariance):
         P = sheared(P, len(local), self._all_turning(references))
         order = np.argsort(np.append(np.flatnonzero(is_active), others))
         joint = copy(self._form)
-        columns = np.append(np.arange(self.first), joint._columns(order))
+        columns = np.append(np.arange(self.first), self.chart.of_landmarks(order))
         joint._matrix = SymmetricMatrix(P[np.ix_(columns, columns)])
         return joint
 
@@ -312,6 +366,8 @@ class CompressedCovariance(JointCovariance):
         rows, are_out = self._in_panel(number)
         moved = self._moved(number, rows, are_out)
         self._observer.a[rows[are_out]] += moved.shifts[are_out]
+        if self.chart.turn:
+            self._observer.orientations.turn(rows[are_out], moved.turns[are_out])
         self._outside.make(number, moved)
         self._changed += 1
 
@@ -331,7 +387,7 @@ class CompressedCovariance(JointCovariance):
 
     def _views(self, rows: IntArray) -> list[View]:
         """Return what landmarks (m,) out of view are now, panel by panel in ascending order."""
-        views, outside = [], self._outside
+        views, outside, k = [], self._outside, self._axes.point
         for number, local in outside.by_panel(self._slots[rows]):
             in_panel, are_out = self._in_panel(number)
             moved = None
@@ -342,6 +398,8 @@ class CompressedCovariance(JointCovariance):
             X = outside.completed(number, are_out, moved)
             shifts = shifts + self._shifts(self._points(in_panel) + shifts - panel.references, X)
             at, blocks = np.sort(local), X.reshape(len(in_panel), self._stride, -1)
+            turns = self._postponed.turns(blocks[at, k:], panel.turned, self._axes)
+            turns = turns if moved is None else turns @ moved.turns[at]
             views.append(
                 View(
                     in_panel[at],
@@ -349,10 +407,30 @@ class CompressedCovariance(JointCovariance):
                     panel.own[at],
                     panel.references[at],
                     shifts[at],
+                    turns,
                     moved,
                 )
             )
         return views
+
+    def _turn(self, number: int, X: FloatArray) -> None:
+        """Turn the tags of a panel."""
+        if not self.chart.turn:
+            return
+        rows, are_out = self._in_panel(number)
+        panel, each = self._outside.panels[number], X.reshape(len(rows), self._stride, -1)
+        turns = self._postponed.turns(each[:, self._axes.point :], panel.turned, self._axes)
+        self._observer.orientations.turn(rows[are_out], turns[are_out])
+        panel.turned = len(self._postponed.gains or [])
+
+    def _forget_gains(self) -> None:
+        """Forget those by which all tags have been turned."""
+        panels, gains = self._outside.panels, self._postponed.gains
+        done = min((panel.turned for panel in panels), default=0)
+        if gains is not None and done:
+            del gains[:done]
+            for panel in panels:
+                panel.turned -= done
 
     def _shifts(self, off: FloatArray, X: FloatArray) -> FloatArray:
         """Return how far landmarks of a panel, ``off`` (slots, 3) their references, move."""
@@ -370,7 +448,8 @@ class CompressedCovariance(JointCovariance):
         new = released[all_slots[released] < 0]
         all_slots[new] = outside.new_slots(len(new))
         released = released[np.argsort(all_slots[released])]
-        columns, points = self._columns(released), self._observer.points[released]
+        columns = self.chart.of_landmarks(self._places[released])
+        points = self._observer.points[released]
         # η = ξ − T ε with x and with each other.
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]
@@ -396,7 +475,7 @@ class CompressedCovariance(JointCovariance):
         self.P = P[np.ix_(kept, kept)]
         self._set_active(self.active[~np.isin(self.active, released)], len(self._places))
         self._set_slots(all_slots)
-        self._postponed = PostponedCorrection(self.P, self._axes.point)
+        self._postponed = self._nothing_postponed()
 
     def _take_in(self, rows: IntArray) -> None:
         """Make landmarks (m,) active, too."""
@@ -411,6 +490,8 @@ class CompressedCovariance(JointCovariance):
         slots, views = self._slots[rows], self._views(rows)
         X = np.concatenate([view.X for view in views]).reshape(len(rows) * self._stride, -1)
         self._observer.a[rows] += np.concatenate([view.shifts for view in views])
+        if self.chart.turn:
+            self._observer.orientations.turn(rows, np.concatenate([view.turns for view in views]))
         among, XPsi = outside.among(slots, views), X @ postponed.Psi
         # ξ = η + T ε with x and with each other.
         T = self._all_turning(np.concatenate([view.references for view in views]))
@@ -446,11 +527,9 @@ class CompressedCovariance(JointCovariance):
         own = own + turned + transpose(turned) + T @ self.pose @ transpose(T)
         return to_state + T @ self.P[:p, :q], own
 
-    def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
-        super()._insert(rows, C, noise)
-        Phi = self._postponed.Phi
-        q = C.shape[2]
-        Phi[self._columns(rows)] = C.reshape(-1, q) @ Phi[:q]
+    def _set(self, columns: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        super()._set(columns, C, noise)
+        self._postponed.Phi[columns] = C @ self._postponed.Phi[: C.shape[1]]
 
     def _make_room(self, m: int) -> IntArray:
         """Append rows and columns for m landmarks; return which landmarks they are."""
@@ -461,8 +540,21 @@ class CompressedCovariance(JointCovariance):
         self._postponed.extend(self._stride * m)
         return new
 
+    def _known_blocks(self, covariances: FloatArray) -> FloatArray:
+        """Return the covariances (m, …, …) of all that is estimated of known landmarks."""
+        k, blocks = self._axes.point, np.zeros((len(covariances), self._stride, self._stride))
+        blocks[:, :k, :k] = covariances[:, :k, :k]
+        blocks[:, np.arange(k, self._stride), np.arange(k, self._stride)] = self._unknown
+        return blocks
+
+    def _nothing_postponed(self) -> PostponedCorrection:
+        return PostponedCorrection(self.P, self._axes.point, self.chart.turn > 0)
+
     def _columns(self, rows: IntArray) -> IntArray:
         return super()._columns(self._places[rows])
+
+    def _turn_columns(self, rows: IntArray) -> IntArray:
+        return super()._turn_columns(self._places[rows])
 
 
 def _whitened(S: FloatArray, right: FloatArray) -> FloatArray:

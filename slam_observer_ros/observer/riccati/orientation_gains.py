@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import (
@@ -78,19 +78,23 @@ class OrientationGains(Filter):
         # Of those that both have, B̂_i B_iᵀ = exp(ω_i), unless they contradict each other.
         known, R = rows[own], R[own]
         omega = self.axes.turns(so3.log(self.orientations.B[known] @ transpose(B[own])))
-        near = distances(omega, self.joint.project_own_turns(known)[1], R)
+        near = mahalanobis(omega, self.joint.own_turns(known) + R)
         agree = near <= self._settings.rejection_threshold
         if agree.any():
+            self.joint.activate(known[agree])
             HP, HPH = self.joint.project_own_turns(known[agree])
             S = with_blocks(HPH, R[agree])
             self._move(-self.joint.update(HP, S, omega[agree].ravel()))
+
+    def orientation_matrices(self, rows: IntArray) -> FloatArray:
+        """Return B̂_i (m, 3, 3) of landmarks, zero for those that have none."""
+        return self.joint.turned(rows, self.orientations.B[rows])
 
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
         """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
         if self.is_exact:
             return self.orientations.map_sigmas[rows]
-        _, P = self.joint.project_own_turns(rows)
-        largest = np.linalg.eigvalsh(diagonal_blocks(P, self.axes.turn))[:, -1]
+        largest = np.linalg.eigvalsh(self.joint.own_turns(rows))[:, -1]
         return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
 
     def _turns(self, rows: IntArray, Z: FloatArray) -> FloatArray:

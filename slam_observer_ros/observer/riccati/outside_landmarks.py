@@ -15,7 +15,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import block_diagonal, diagonal_blocks, transpose
+from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
 from slam_observer_ros.observer.riccati.panel_matrix import PANEL_ROWS, PanelMatrix
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 
@@ -50,6 +50,7 @@ class Panel:
     X: FloatArray  # (PANEL_ROWS, …) cov(η, x₀), and the first of the columns that are taken
     own: FloatArray  # (slots, k, k) diagonal blocks of B
     references: FloatArray  # (slots, 3) y_i°, metres
+    turned: int = 0  # corrections since x began by which tags have been turned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +59,7 @@ class Moved:
 
     panel: Panel
     shifts: FloatArray  # (slots, 3) how far estimates have been moved, metres
+    turns: FloatArray  # (slots, 3, 3) and turned
     U: FloatArray  # (PANEL_ROWS, r + 2 s) to be added to B
     V: FloatArray  # (PANEL_ROWS, m k) the columns of B of those that are not in x any more
 
@@ -71,6 +73,7 @@ class View:
     own: FloatArray  # (m, k, k)
     references: FloatArray  # (m, 3) metres
     shifts: FloatArray  # (m, 3) how far estimates have yet to be moved, metres
+    turns: FloatArray  # (m, 3, 3) and be turned
     moved: Moved | None  # what is left to be done to their panel
 
 
@@ -88,13 +91,15 @@ class OutsideLandmarks:
         self.size = size  # q₀
         self.taken: IntArray = np.empty(0, dtype=np.int64)  # (t,) slots
         self.unchanged: dict[int, Change] = {}  # panels to which one has yet to happen
-        self._free: list[int] = []
+        self._unused: list[int] = []
+        self._left: list[int] = []  # slots of landmarks that were removed
 
     def copy(self) -> OutsideLandmarks:
         """Return an independent copy."""
         other = copy(self)
         other.matrix, other.panels = self.matrix.copy(), [copy(panel) for panel in self.panels]
-        other.unchanged, other._free = self.unchanged.copy(), self._free.copy()
+        other.unchanged = self.unchanged.copy()
+        other._unused, other._left = self._unused.copy(), self._left.copy()
         return other
 
     @property
@@ -108,21 +113,26 @@ class OutsideLandmarks:
 
     def new_slots(self, count: int) -> IntArray:
         """Return free slots for so many landmarks, ascending."""
+        used = self._left[:count]
+        self._left = self._left[len(used) :]
+        return np.sort(np.append(used, self._unused_slots(count - len(used)))).astype(np.int64)
+
+    def _unused_slots(self, count: int) -> IntArray:
+        """Return slots of which B is zero, ascending."""
         each, k = self.slots_each, self._stride
-        while len(self._free) < count:
-            self._free += range(each * len(self.panels), each * (len(self.panels) + 1))
+        while len(self._unused) < count:
+            self._unused += range(each * len(self.panels), each * (len(self.panels) + 1))
             width = self.size + k * len(self.taken)
             X, own = np.zeros((PANEL_ROWS, width)), np.zeros((each, k, k))
             self.panels.append(Panel(X, own, np.zeros((each, 3))))
             self.matrix.append()
-        self._free.sort()
-        slots, self._free = self._free[:count], self._free[count:]
+        slots, self._unused = self._unused[:count], self._unused[count:]
         return np.array(slots, dtype=np.int64)
 
     def remove(self, slots: IntArray) -> None:
-        """Forget landmarks. What B has of them nobody reads."""
+        """Forget landmarks. What B has of them is replaced with that of others."""
         self.clear(slots)
-        self._free += slots.tolist()
+        self._left += slots.tolist()
 
     def clear(self, slots: IntArray) -> None:
         """Let X of landmarks be zero."""
@@ -141,8 +151,8 @@ class OutsideLandmarks:
 
     def add_independent(self, points: FloatArray, covariances: FloatArray) -> IntArray:
         """Add landmarks (m,) whose errors are independent of all others; return their slots."""
-        slots = self.new_slots(len(points))
-        self.set_independent(slots, slice(self._stride), covariances)
+        slots = self._unused_slots(len(points))
+        self._set_own(slots, slice(self._stride), covariances)
         self.refer(slots, points)
         return slots
 
@@ -152,20 +162,24 @@ class OutsideLandmarks:
         Their covariances are (m, …, …). Nothing may be taken, and no change be going on.
         """
         rows = self._rows(slots)[:, entries].ravel()
-        covariance, done = block_diagonal(covariances), 0
         for number, panel in enumerate(self.panels):
-            first, last = np.searchsorted(rows, PANEL_ROWS * np.array([number, number + 1]))
-            columns, local = np.zeros((PANEL_ROWS, len(rows))), rows[first:last] % PANEL_ROWS
-            columns[local] = covariance[first:last]
-            self.matrix.set_columns(number, rows, columns)
-            if not len(local):
-                continue
-            X, own = panel.X.copy(), panel.own.copy()
-            X[local] = 0.0
-            mine = slots[slots // self.slots_each == number] % self.slots_each
-            own[mine, entries] = own[mine, :, entries] = 0.0
-            own[mine, entries, entries] = covariances[done : done + len(mine)]
-            panel.X, panel.own, done = X, own, done + len(mine)
+            self.matrix.set_columns(number, rows, np.zeros((PANEL_ROWS, len(rows))))
+            local = rows[rows // PANEL_ROWS == number] % PANEL_ROWS
+            if len(local):
+                panel.X = panel.X.copy()
+                panel.X[local] = 0.0
+        self._set_own(slots, entries, covariances)
+
+    def _set_own(self, slots: IntArray, entries: slice, covariances: FloatArray) -> None:
+        """Set what landmarks, ascending, have on the diagonal of B, where nothing is."""
+        begin = 0
+        for number, local in self.by_panel(slots):
+            blocks, panel = covariances[begin : begin + len(local)], self.panels[number]
+            begin += len(local)
+            self.matrix.add_blocks(number, self._rows(local)[:, entries], blocks)
+            panel.own = panel.own.copy()
+            panel.own[local, entries] = panel.own[local, :, entries] = 0.0
+            panel.own[local, entries, entries] = blocks
 
     def refer(self, slots: IntArray, points: FloatArray) -> None:
         """Let landmarks, ascending, refer to ``points`` (m, 3)."""
@@ -222,8 +236,9 @@ class OutsideLandmarks:
         X = before @ change.postponed.Phi.T
         # Where the estimate has moved to, the reference follows, …
         was_off = np.where(were_out[:, None], points - panel.references, 0.0)
-        off, of_points = was_off.copy(), before.reshape(len(points), self._stride, -1)[:, :k]
-        off[:, :k] = change.postponed.shifted(was_off[:, :k], of_points)
+        off, each = was_off.copy(), before.reshape(len(points), self._stride, -1)
+        off[:, :k] = change.postponed.shifted(was_off[:, :k], each[:, :k])
+        turns = change.postponed.turns(each[:, k:], panel.turned, self._axes)
         s = len(change.turns)
         D = np.zeros((PANEL_ROWS, s))
         D.reshape(len(points), self._stride, s)[:, :k] = self._axes.turn_matrix(off)[:, :, :s]
@@ -240,7 +255,7 @@ class OutsideLandmarks:
         X[rows], V[rows] = change.to_x[of_change], change.own[of_change]
         own[new] = diagonal_blocks(change.own, self._stride)[at]
         references[new] = change.points[at]
-        return Moved(Panel(X, own, references), off - was_off, U, V)
+        return Moved(Panel(X, own, references), off - was_off, turns, U, V)
 
     def make(self, number: int, moved: Moved) -> None:
         """Let a panel have changed."""

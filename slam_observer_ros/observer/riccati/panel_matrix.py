@@ -80,6 +80,11 @@ class PanelMatrix:
             if other >= number:
                 self._writable(other)[local, own] = new.T
 
+    def add_blocks(self, number: int, rows: IntArray, blocks: FloatArray) -> None:
+        """Add blocks (m, k, k) on the diagonal, in rows (m, k) of a panel."""
+        columns = rows + PANEL_ROWS * number
+        self._writable(number)[rows[:, :, None], columns[:, None, :]] += blocks
+
     def among(self, indices: IntArray, U: FloatArray) -> FloatArray:
         """Return M (m, m) at ascending ``indices`` (m,), which have the rows ``U`` of U."""
         found, w = np.empty((len(indices),) * 2), self._w

@@ -19,7 +19,7 @@ from typing import ClassVar, TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     mahalanobis,
@@ -321,10 +321,12 @@ class RiccatiFilter(OrientationGains):
         return self.joint.followed(rows, super().translations(rows))
 
     def _compress_if_large(self, added: int) -> None:
-        """Go on with a covariance for many landmarks, unless they move or have orientations."""
-        is_large = len(self.observer.y_ref) + added > self.block.dense
+        """Go on with a covariance for many landmarks, unless they move."""
+        # Tags count by what is estimated of them: relinearising ends there, too.
+        count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
+        is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        if self.joint.is_dense and is_large and not may_move and not self.estimates_orientations:
+        if self.joint.is_dense and is_large and not may_move:
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
@@ -336,4 +338,4 @@ class RiccatiFilter(OrientationGains):
         if step.velocities is not None:
             observer.correct_velocities(X.A, moved, step.velocities)
         if step.turns is not None:
-            self.orientations.turn(moved, step.turns)
+            self.orientations.turn(moved, so3.exp(step.turns))
