@@ -229,10 +229,14 @@ class Estimator:
         """
         try:
             check_event(event, self.settings)
-            jumped = self._queue.push(event)
+            passes = self._queue.passes(event)
+            jumped = not passes and self._queue.push(event)
         except InvalidEventError as error:
             self._drop(error)
             return False
+        if passes:  # as nearly always
+            self._process(event)
+            return True
         if jumped:
             self.handle_clock_jump(event.stamp_ns - (self.newest_stamp_ns or 0))
             self._queue.push(event)
