@@ -150,6 +150,12 @@ KINDS = {
         'ranges of {sensor} are to be multiplied by {found}',
         'set range_scale: {value:.4f}',
     ),
+    'depth_for_range': Kind(
+        Level.WARNING,
+        'the range looks like {looks}: off the axis it grows with the cosine to the power of '
+        '{power:.2f} ± {deviation:.2f}',
+        'set range_is_depth: {set_to}, or run slam-observer calibrate (Calibrate a sensor)',
+    ),
     'noisy_odometry': Kind(
         Level.WARNING,
         'the odometry is {factor:.1f} × noisier in {motion} than stated',
@@ -296,10 +302,10 @@ KINDS = {
     ),
     'large_map': Kind(
         Level.WARNING,
-        'the map has {count} landmarks. Where they move or have orientations, time and memory '
-        'that riccati gains take grow with their square: 70 ms a step and 0.5 GB for 600 tags',
-        'max_landmarks limits them; use_tag_orientation: false takes a step of a large map back '
-        'to that of a small one',
+        'the map has {count} landmarks. Where they move, time and memory that riccati gains take '
+        'grow with their square: 70 ms a step and 0.5 GB for 600 landmarks in space',
+        'max_landmarks limits them; landmark_velocity_stddev: 0.0 is for those at rest, of which '
+        'many cost no more than few',
     ),
     'loaded_map': Kind(
         Level.WARNING,
@@ -321,6 +327,11 @@ KINDS = {
         Level.WARNING,
         'landmarks {ids} have moved',
         'if they have not, state more noise, or look at odometry and ids',
+    ),
+    'carried_landmark': Kind(
+        Level.WARNING,
+        'landmarks {ids} move with the robot, and are not used',
+        'nothing is wrong if it carries them; where they stay behind they are used again',
     ),
     'many_moved': Kind(
         Level.WARNING,

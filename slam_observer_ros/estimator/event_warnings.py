@@ -77,6 +77,12 @@ class EventWarnings:
             self._moved_ns = {}
             self.warn('many_moved', count=len(lately))
 
+    def carried_landmarks(self, ids: set[int]) -> None:
+        """Warn of landmarks that move with the robot, whenever there are more of them."""
+        if len(ids) > self._reported['carried_landmark']:
+            logger.warning('%s', found('carried_landmark', ids=listed(sorted(ids))).text())
+        self._reported['carried_landmark'] = len(ids)
+
     def unexpected_poses(self, counts: Sequence[int]) -> None:
         """Warn that the robot is not where it was taken to be, if one of these has grown."""
         for name, count in zip(UNEXPECTED_POSES, counts, strict=True):

@@ -501,12 +501,12 @@ class TestMalformed:
             assert str(error)
 
     @all_decoders
-    def test_thousands_of_mutations_never_raise_anything_else(self, key):
+    def test_a_thousand_mutations_never_raise_anything_else(self, key):
         """Lengths, numbers and texts that no publisher sends, in any place."""
         random = np.random.default_rng(list(key[0].encode()))
         words = [0, 1, 0x7F, 0xFF, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 0x7F800000, 0x7FC00000]
         whole = np.frombuffer(EXAMPLES[key[0]], np.uint8)
-        for _ in range(4000):
+        for _ in range(1000):
             raw = whole.copy()
             for _ in range(random.integers(1, 5)):
                 at = random.integers(len(raw) - 4)

@@ -116,7 +116,7 @@ class JointCovariance:
         with_pose, p = self.with_pose(rows, points), self._p
         if with_pose is None or not len(tags):
             return None if with_pose is None else with_pose[p:, p:]
-        of_turns = self.chart.turns(tags)
+        of_turns = self._turn_columns(tags)
         columns = np.concatenate([np.arange(p), self._columns(rows), of_turns])
         P, L = self.P[np.ix_(columns, columns)], np.zeros((len(columns) - p, p))
         L[: len(L) - len(of_turns)] = -self._turning(points).reshape(-1, p)
@@ -129,9 +129,13 @@ class JointCovariance:
         """Return the same with all landmarks in P."""
         return self
 
-    def postponed_shifts(self, rows: IntArray) -> FloatArray:
-        """Return how far landmarks (m, 3) have yet to be moved, metres."""
-        raise NotImplementedError
+    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
+        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
+        return a
+
+    def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
+        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
+        return B
 
     # The step
 
@@ -179,7 +183,7 @@ class JointCovariance:
     ) -> tuple[FloatArray, FloatArray]:
         """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω − ω_i + D c̃, D (3, c)."""
         C = np.tile(self.chart.turn_output(D), (len(rows), 1))
-        return self._project(C, self.chart.turns(rows))
+        return self._project(C, self._turn_columns(rows))
 
     def _project(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
         q = C.shape[1]
@@ -266,8 +270,15 @@ class JointCovariance:
 
     def project_own_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return H P (m q, …) and H P Hᵀ (m q, m q) of ω_i."""
-        columns = self.chart.turns(rows)
-        return self.P[columns], self.P[np.ix_(columns, columns)]
+        columns = self._turn_columns(rows)
+        HP = self.P[columns]
+        return HP, HP[:, columns]
+
+    def own_turns(self, rows: IntArray) -> FloatArray:
+        """Return the covariances (m, q, q) of each ω_i, rad²."""
+        columns = self._turn_columns(rows).reshape(len(rows), self.chart.turn)
+        covariances: FloatArray = self.P[columns[:, :, None], columns[:, None, :]]
+        return covariances
 
     def project_turn_differences(
         self, rows: IntArray, others: IntArray
@@ -282,11 +293,11 @@ class JointCovariance:
     ) -> None:
         """Take over orientations (m,) seen for the first time: ω_i = φ_i + noise (m, q, q)."""
         C = np.tile(self.chart.turn_output(D), (len(rows), 1))
-        self._set(self.chart.turns(rows), C, block_diagonal(covariances))
+        self._set(self._turn_columns(rows), C, block_diagonal(covariances))
 
     def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
         """Take over orientations (m,) whose errors (m, q, q) are independent of all else."""
-        columns = self.chart.turns(rows)
+        columns = self._turn_columns(rows)
         self._set(columns, np.zeros((len(columns), self._p)), block_diagonal(covariances))
 
     def copy_turns(self, source: IntArray, target: IntArray) -> None:
@@ -325,7 +336,7 @@ class JointCovariance:
         # ξ_i = C_i (ε, c̃) + noise of this covariance (m k, m k); of all else nothing is known.
         self._set(self._columns(rows), C.reshape(-1, C.shape[2]), noise)
         if len(self._unknown):
-            others = np.append(self.chart.turns(rows), self.chart.velocities(rows))
+            others = np.append(self._turn_columns(rows), self.chart.velocities(rows))
             unknown = np.tile(self._unknown, len(rows))
             self._set(others, np.zeros((len(others), self._p)), np.diag(unknown))
 
@@ -345,6 +356,9 @@ class JointCovariance:
 
     def _columns(self, rows: IntArray) -> IntArray:
         return self.chart.points(rows)
+
+    def _turn_columns(self, rows: IntArray) -> IntArray:
+        return self.chart.turns(rows)
 
     def _all_turning(self, points: FloatArray) -> FloatArray:
         return self.chart.all_still(points)
