@@ -5,6 +5,7 @@ VENV := .venv
 PYTHON_IN_VENV := $(VENV)/bin/python
 READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),$(ROS_WHEELS:%=%-wheels),wheels)
 READY_TO_DEVELOP := $(READY)-to-develop
+CORE := $(VENV)/core-is-built
 
 ifdef ROS_DISTRO
 PIP_LIMITS = "numpy==$$($(PYTHON_IN_VENV) -c 'import numpy; print(numpy.__version__)')"
@@ -28,10 +29,10 @@ LOCK = $(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
 
-demo: $(READY)  ## run simulator and observer until they converge; pictures in demo_output/
+demo: $(READY) $(CORE)  ## run simulator and observer until they converge; pictures in demo_output/
 	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.demo
 
-robot: $(READY)  ## localise a simulated robot among AprilTags, as for Nav2; OPTIONS=--help
+robot: $(READY) $(CORE)  ## localise a simulated robot among AprilTags, as for Nav2; OPTIONS=--help
 	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.robot $(OPTIONS)
 
 test: lint pytest colcon  ## everything that a change must pass
@@ -47,7 +48,7 @@ format: $(READY_TO_DEVELOP)  ## let ruff mend style and layout
 	$(VENV)/bin/ruff format --no-cache
 
 # The tests of one file share nodes and a ROS domain; those of two have nothing in common.
-pytest: $(READY_TO_DEVELOP)  ## the tests alone
+pytest: $(READY_TO_DEVELOP) $(CORE)  ## the tests alone
 	scripts/ensure_chromium.sh
 	$(PYTHON_IN_VENV) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
@@ -63,7 +64,7 @@ benchmark-accuracy: $(READY_TO_DEVELOP)  ## compare with GTSAM's iSAM2 on real r
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
 
-benchmark: $(READY_TO_DEVELOP)  ## what it costs, as ratios; rewrites docs/performance.md
+benchmark: $(READY_TO_DEVELOP) $(CORE)  ## what it costs, as ratios; rewrites docs/performance.md
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/performance.py --write-docs
 
@@ -86,6 +87,11 @@ $(READY_TO_DEVELOP): $(READY) requirements-develop.lock
 	scripts/setup_venv.sh $(VENV) develop
 	touch $@
 
+# Where there is a compiler; it was built with the rest at first, and is again when it changes.
+$(CORE): slam_observer_ros/observer/_core.c | $(READY)
+	$(PYTHON_IN_VENV) setup.py --quiet build_ext --inplace
+	touch $@
+
 clean:  ## remove all that make made, but demo_output
-	rm -rf $(VENV) build install log site *.egg-info .hypothesis
+	rm -rf $(VENV) build install log site *.egg-info .hypothesis slam_observer_ros/observer/*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

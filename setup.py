@@ -2,7 +2,7 @@
 
 from glob import glob
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
 
 PACKAGE = 'slam_observer_ros'
 
@@ -36,7 +36,15 @@ setup(
         (f'share/{PACKAGE}/samples', glob('samples/*.mcap')),
         (f'share/{PACKAGE}/foxglove', glob('foxglove/*.json')),
     ],
-    zip_safe=True,
+    ext_modules=[
+        Extension(
+            f'{PACKAGE}.observer._core',
+            [f'{PACKAGE}/observer/_core.c'],
+            extra_compile_args=['-O3', '-fno-math-errno'],
+            optional=True,  # without a compiler numpy does the same
+        )
+    ],
+    zip_safe=False,
     python_requires='>=3.10',
     install_requires=[
         'setuptools',  # what colcon builds ament_python packages with

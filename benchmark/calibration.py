@@ -1,8 +1,9 @@
 """What systematic errors of a sensor cost: in simulated loops, and in MRCLAM 6.
 
 ``python benchmark/calibration.py`` drives small loops with each error alone and with all, whose
-figures the settings state, then robots of MRCLAM 6 with the shipped settings, beside iSAM2 on the
-same points, corrected as the settings state. Ratios are to the runs without an error.
+figures the settings state; then what ``slam-observer calibrate`` finds in a surveyed map, with all
+of them, in twice as many drives; then robots of MRCLAM 6 with the shipped settings, beside iSAM2
+on the same points, corrected as the settings state. Ratios are to the runs without an error.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import logging
+from pathlib import Path
 import sys
 from typing import Any
 
@@ -19,14 +21,19 @@ from threadpoolctl import threadpool_limits
 import worlds
 from worlds import drive, Loop, simulated_settings, World
 
+from slam_observer_ros.cli.calibrate.finder import Finder
+from slam_observer_ros.cli.tune.material import Material
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.recording.recorded_truth import Truth
 
 LOOPS = {
     'plane': Loop('wheeled_bearing_range', 60.0, 150.0, 20, 6.0, 5),
@@ -42,6 +49,21 @@ JUDGED_EVERY_S = 5.0
 """Seconds from one comparison of errors with covariances to the next."""
 
 ROBOTS = 5
+
+SURVEYED_M = 0.005
+"""Standard deviation of each coordinate of a surveyed map."""
+
+EIGHTS = Loop('wheeled_robot', 20.0, 180.0, 20, 8.0, 5)
+"""Eights, as docs/calibrate_a_sensor.md has them driven; a lap is one of them."""
+
+TO_BE_FOUND = {
+    'sensor_rotation_z': ANGLE,
+    'sensor_translation_x': SHIFT_M,
+    'sensor_translation_y': -SHIFT_M,
+    'range_scale': LONGER,
+    'velocity_delay': 0.2,
+}
+"""How the sensor and the clock of :func:`surveyed_drive` err."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,11 +230,54 @@ def compare_recordings() -> None:
     )
 
 
+def surveyed_drive(seed: int) -> Material:
+    """Drive eights, and turn on the spot, among surveyed landmarks, with all errors at once."""
+    settings = replace(simulated_settings(EIGHTS.config), localization_mode='uncertain')
+    t_s = np.arange(round(EIGHTS.duration_s * worlds.VELOCITY_RATE_HZ)) / worlds.VELOCITY_RATE_HZ
+    V = np.zeros((len(t_s), 6))
+    on_the_spot = t_s % 30.0 > 24.0
+    V[:, 2] = 0.8 * np.sign(np.sin(2.0 * np.pi * t_s / EIGHTS.lap_s))
+    V[:, 3] = 0.5 + 0.2 * np.sin(2.0 * np.pi * t_s / 7.0)
+    V[on_the_spot, 2] = np.where(t_s[on_the_spot] % 60.0 < 30.0, 1.0, -1.0)
+    V[on_the_spot, 3] = 0.0
+    poses = se3.path(np.eye(4), V / worlds.VELOCITY_RATE_HZ)
+    rng = np.random.default_rng(seed)
+    n = EIGHTS.landmarks
+    points = rng.uniform([-6.0, -6.0, 0.0], [6.0, 6.0, 0.0], (n, 3))
+    plain = worlds.recorded_on(
+        poses, LandmarkTruth(np.arange(n), points), np.zeros((n, 3)), EIGHTS, settings, rng
+    )
+    events = Fault(ANGLE, SHIFT_M, LONGER, -TO_BE_FOUND['velocity_delay']).put_in(plain).events
+    surveyed = points + SURVEYED_M * rng.standard_normal((n, 3)) * np.array([1.0, 1.0, 0.0])
+    covariances = np.tile(SURVEYED_M**2 * np.eye(3), (n, 1, 1))
+    known = LandmarkMap(np.arange(n), surveyed, covariances, np.full(n, 10))
+    none = Truth(np.empty(0, np.int64), np.empty((0, 4, 4)), None)
+    end_ns = events[-1].stamp_ns + 1
+    return Material(Path(f'seed {seed}'), '', events, none, EIGHTS.max_range_m, end_ns, known)
+
+
+def calibrate_drives(seeds: int) -> None:
+    """Write how far what `slam-observer calibrate` finds is off, in standard deviations."""
+    settings = replace(simulated_settings(EIGHTS.config), localization_mode='uncertain')
+    off: dict[str, list[float]] = {}
+    share: dict[str, list[float]] = {}
+    for seed in range(seeds):
+        found = Finder(surveyed_drive(seed), settings, (), lambda: None).find(True)
+        for part in found.parts:
+            true = TO_BE_FOUND.get(part.name, part.nominal)
+            off.setdefault(part.name, []).append((part.value - true) / part.deviation)
+            share.setdefault(part.name, []).append(part.deviation / abs(true - part.nominal or 1))
+    sys.stdout.write(f'{"":32} mean z   rms z   max z  σ/error (scales, biases: σ)\n')
+    for name, z in off.items():
+        figures = (np.mean(z), np.sqrt(np.mean(np.square(z))), np.abs(z).max(), max(share[name]))
+        sys.stdout.write(f'{name:30}' + ''.join(f'{figure:8.3f}' for figure in figures) + '\n')
+
+
 def main() -> None:
     """Run everything and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seeds', type=int, default=10)
-    parser.add_argument('--only', choices=('plane', 'space', 'recordings'))
+    parser.add_argument('--only', choices=('plane', 'space', 'drives', 'recordings'))
     args = parser.parse_args()
     threadpool_limits(1)
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
@@ -220,6 +285,8 @@ def main() -> None:
     for name in LOOPS:
         if args.only in (None, name):
             compare_loops(name, args.seeds)
+    if args.only in (None, 'drives'):
+        calibrate_drives(2 * args.seeds)
     if args.only in (None, 'recordings'):
         compare_recordings()
 

@@ -243,11 +243,23 @@ def drive(loop: Loop, settings: Settings, seed: int) -> World:
     t_s = np.arange(round(loop.duration_s * VELOCITY_RATE_HZ) + 1) / VELOCITY_RATE_HZ
     course = _course(loop, t_s, settings.two_d_mode)
     poses = se3.inverse(course[0]) @ course
-    stamps_ns = np.rint(t_s * 1e9).astype(np.int64)
     points = se3.transform(se3.inverse(course[0]), _roadside(loop, settings.two_d_mode, rng))
     walks = _walks(loop, settings.two_d_mode, seed) @ course[0][:3, :3]
     points -= loop.lap_s * np.linspace(0.0, 1.0, loop.landmarks)[:, None] * walks
     landmarks = LandmarkTruth(np.arange(loop.landmarks), points)
+    return recorded_on(poses, landmarks, walks, loop, settings, rng)
+
+
+def recorded_on(
+    poses: FloatArray,
+    landmarks: LandmarkTruth,
+    walks: FloatArray,
+    loop: Loop,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> World:
+    """Return what is measured on a way of poses (k, 4, 4), among landmarks at ``walks`` m/s."""
+    stamps_ns = np.rint(np.arange(len(poses)) * 1e9 / VELOCITY_RATE_HZ).astype(np.int64)
     # Truth is at the stamps of velocities and between them, where landmarks are seen.
     steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:])
     between = poses[:-1] @ se3.exp(OBSERVED_AFTER_S * VELOCITY_RATE_HZ * steps)

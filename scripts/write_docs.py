@@ -14,6 +14,7 @@ import os
 from pathlib import Path
 import re
 import sys
+from typing import get_args
 
 # Nothing outside may be heard here, nor hear these nodes. Read when rclpy starts.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
@@ -26,6 +27,7 @@ from slam_observer_ros.nodes.observer_nodes import ObserverNode
 from slam_observer_ros.nodes.simulator import SimulatorNode
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import AUTO, InputSettings
+from slam_observer_ros.settings.message_types import message_types, Role
 from slam_observer_ros.settings.node_settings import (
     ManagedNodeSettings,
     ObserverNodeSettings,
@@ -182,6 +184,7 @@ def tables(observer: Interface, simulator: Interface) -> dict[str, str]:
     """Return the Markdown of every table by its name in the pages."""
     return {
         'inputs': input_table(observer.subscribed),
+        'message-types': message_type_table(),
         'outputs': topic_table('topic', observer.published, OUTPUTS),
         'services': topic_table('service', observer.services, SERVICES),
         'simulator-outputs': topic_table('topic', simulator.published, SIMULATED),
@@ -205,6 +208,16 @@ def input_table(subscribed: dict[str, Topic]) -> str:
         ('topic', 'type', 'what it gives'),
         [(f'`{name}`', types[name], text) for name, text in INPUTS.items()],
     )
+
+
+def message_type_table() -> str:
+    """Return the table of the message types that are read, and as what."""
+    rows = [
+        (f'`{name}`', role, known.package)
+        for role in get_args(Role)
+        for name, known in message_types(role).items()
+    ]
+    return markdown(('type', 'read as', 'published by'), rows)
 
 
 def topic_table(kind: str, topics: dict[str, Topic], texts: dict[str, str]) -> str:

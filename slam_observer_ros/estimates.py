@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 import math
 
@@ -20,24 +19,8 @@ UNUSED_POINTS = {
 }
 """Names under which observed points that are not used are counted, and what they are."""
 
-MAX_REJECTED = 0.1
-"""Share of the points beyond which they are more than a sensor's outliers."""
-
-MAX_REJECTED_ORIENTATIONS = 0.5
-"""Share of the points beyond which they are more than the flips of small or frontal tags."""
-
-NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
-"""Least delay of velocities that is worth a finding, and by how many of its deviations."""
-
 DELAY_NAME = 'velocity_delay'
 """Name of the delay of velocities."""
-
-IMPLAUSIBLE = 4.0
-"""Stated standard deviations by which no calibration is off: something else is wrong."""
-
-
-NOTABLY_NOISIER = 1.5
-"""Factor of the noise of the odometry from which it is named as a problem."""
 
 
 def used_points(counts: Counter[str]) -> int:
@@ -89,27 +72,6 @@ class Update:
     innovation: NormalisedInnovation | None = None
 
 
-MOUNTED = {
-    'sensor_rotation': (
-        (
-            'further rolled to the right/further rolled to the left',
-            'further down/further up',
-            'further to the left/further to the right',
-        ),
-        ('roll', 'pitch', 'yaw'),
-    ),
-    'sensor_translation': (
-        (
-            'further forward/further back',
-            'further to the left/further to the right',
-            'higher/lower',
-        ),
-        ('x', 'y', 'z'),
-    ),
-}
-"""In words, by axis, how a sensor is mounted whose turn or shift is positive/negative."""
-
-
 @dataclass(frozen=True, slots=True)
 class CalibrationEstimate:
     """What was found out about one property of the velocity, or of a sensor.
@@ -128,45 +90,6 @@ class CalibrationEstimate:
     stated: float = math.inf
 
     @property
-    def problem(self) -> str:
-        """What is wrong if it is further from nominal than the settings can mean; else ''."""
-        times = abs(self.value - self.nominal) / self.stated
-        if times <= IMPLAUSIBLE:
-            return ''
-        factor, unit = self.for_people
-        value, stated, nominal = factor * self.value, factor * self.stated, factor * self.nominal
-        return (
-            f'{self.name} is {value:.3g}, {times:.0f} times its stated error ({stated:.3g}) '
-            f'from {nominal:g}{f" {unit}" if unit else ""}: are signs, units and frames of '
-            'velocity and points right?'
-        )
-
-    @property
-    def advice(self) -> str:
-        """What to set so that a sensor is stated as it was found to be; '' if it is, or no sensor.
-
-        It is found where it is three standard deviations off, and those have become a third.
-        """
-        name, _, frame = self.name.partition('/')
-        off, sensor = self.value - self.nominal, frame or 'the sensor'
-        if abs(off) < 3.0 * self.deviation or 3.0 * self.deviation > self.stated:
-            return ''
-        if name == 'range_scale':
-            set_to = f'set range_scale: {self.value:.4f}'
-            return f'ranges of {sensor} are to be multiplied by {self}: {set_to}'
-        part, _, axis = name.rpartition('_')
-        if part not in MOUNTED:
-            return ''
-        factor, unit = self.for_people
-        words, entries = MOUNTED[part]
-        towards = words['xyz'.index(axis)].split('/')[int(off < 0.0)]
-        entry = entries['xyz'.index(axis)]
-        return (
-            f'{sensor} is mounted {abs(factor * off):.2g} ± {factor * self.deviation:.2g} {unit} '
-            f'{towards} than /tf says: add {off:.4f} to {entry} of its transform or sensor_pose'
-        )
-
-    @property
     def for_people(self) -> tuple[float, str]:
         """The factor from ``unit`` to that which people read, and that: degrees for radians."""
         if not self.unit.startswith('rad'):
@@ -181,20 +104,6 @@ class CalibrationEstimate:
         if 0.0 < deviation < math.inf:
             digits = min(max(digits, 1 - math.floor(math.log10(deviation))), 9)
         return f'{value:.{digits}f} ± {deviation:.{digits}f} {unit}'.rstrip()
-
-
-def calibration_problems(calibration: Iterable[CalibrationEstimate]) -> list[str]:
-    """Return what there is to say of estimates: a delay first, as scales make up for it."""
-    parts = list(calibration)
-    for part in parts:
-        notable_s = max(NOTABLE_DELAY_S, CERTAIN * part.deviation)
-        if part.name == DELAY_NAME and abs(part.value) > notable_s:
-            when = 'late' if part.value > 0.0 else 'early'
-            return [
-                f'The odometry takes effect {abs(part.value):.2f} s {when}: mind it in the driver '
-                '(Tune the noise).'
-            ]
-    return [part.problem for part in parts if part.problem]
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,22 +121,18 @@ class MotionFactor:
     applied: float
     proposed: str
 
-    @property
-    def problem(self) -> str:
-        """What to state if the odometry is clearly noisier than stated; else ''."""
-        is_clear = math.log(self.factor) > IMPLAUSIBLE * self.deviation
-        if self.factor < NOTABLY_NOISIER or not is_clear:
-            return ''
-        remedy = f'set {self.proposed}' if self.proposed else 'state more'
-        return (
-            f'the odometry is {self.factor:.1f} × noisier in {self.name} than stated: {remedy}, '
-            'or let its messages state larger covariances'
-        )
-
     def __str__(self) -> str:
         """Write what was found, and what is made of it."""
         found = f'{self.factor:.2f} × as stated (± {100.0 * self.deviation:.0f} %)'
         return f'{found}, taken as {self.applied:.2f} ×'
+
+
+@dataclass(frozen=True, slots=True)
+class RangePower:
+    """The power of the cosine off its axis with which a sensor's ranges grow: 1 for depths."""
+
+    value: float
+    deviation: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,4 +150,6 @@ class Smoothed:
     since: str
     slips: int
     # (n, 3, 3) of the landmarks, world, zero where unknown; None if it is not estimated
-    orientations: FloatArray | None = None
+    orientations: FloatArray | None
+    calibration: list[CalibrationEstimate]  # c, of the last pose if it drifts
+    calibration_correlations: FloatArray  # (c, c)

@@ -1,9 +1,10 @@
-"""Time-stamped events: what the estimator takes in, in the base frame, metres and radians.
+"""Time-stamped events, metres and radians: what messages measure, and the estimator takes in.
 
-Each has ``stamp_ns``, its time of validity, and ``receive_ns``, when it was received by any clock
-that goes on steadily, or None. A covariance that is None, or all zero, is unknown. ``moved``
-brings an event into another frame. Arrays are not copied: who has added an event must not change
-them any more.
+Each has ``stamp_ns``, its time of validity, ``receive_ns``, when it was received by any clock
+that goes on steadily, or None, and ``sensor_frame``, the frame in which decoders give it.
+``moved`` brings it into another one; the estimator wants that of the base. A covariance is along
+the axes of the same frame; one that is None, or all zero, is unknown. Arrays are not copied: who
+has added an event must not change them any more.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class VelocityEvent:
     covariance: FloatArray | None = None  # (6, 6)
     receive_ns: int | None = None
     is_mean: bool = False
+    sensor_frame: str = ''
 
     def moved(self, pose: FloatArray) -> VelocityEvent:
         """Return the velocity of the base, in which this event's frame has ``pose`` T (4, 4).
@@ -80,6 +82,7 @@ class VelocityBlock:
     body_velocities: FloatArray  # (k, 6)
     covariances: FloatArray | None = None  # (k, 6, 6), all of them stated
     receive_ns: IntArray | None = None  # (k,)
+    sensor_frame: str = ''
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -91,6 +94,7 @@ class VelocityBlock:
             self.body_velocities[rows],
             None if self.covariances is None else self.covariances[rows],
             None if self.receive_ns is None else self.receive_ns[rows],
+            self.sensor_frame,
         )
 
     def events(self) -> Iterator[VelocityEvent]:
@@ -100,7 +104,7 @@ class VelocityBlock:
         for columns in zip(
             self.stamps_ns.tolist(), self.body_velocities, covariances, received, strict=True
         ):
-            yield VelocityEvent(*columns)
+            yield VelocityEvent(*columns, sensor_frame=self.sensor_frame)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +119,7 @@ class AngularVelocityEvent:
     angular_velocity: FloatArray  # (3,)
     covariance: FloatArray | None = None  # (3, 3)
     receive_ns: int | None = None
+    sensor_frame: str = ''
 
     def moved(self, pose: FloatArray) -> AngularVelocityEvent:
         """Return it along the axes of the frame in which its own has ``pose`` (4, 4)."""
@@ -144,6 +149,8 @@ class ObservationEvent:
     sensor_frame: str = ''  # of the sensor that saw them; each has a calibration of its own
     sensor_axis: FloatArray | None = None  # (3,) along which it looks, x by default
     sensed: Sensed | None = None  # as the sensor showed them, where they have been corrected
+    # (m,) such as tag36h11, of fiducials whose poses are on /tf: points are NaN until looked up.
+    families: tuple[str, ...] | None = None
 
     def moved(self, pose: FloatArray) -> ObservationEvent:
         """Return it in the frame in which its own has ``pose`` (4, 4)."""
@@ -191,6 +198,12 @@ class ObservationEvent:
             if self.orientation_covariances is None
             else self.orientation_covariances[mask],
         )
+
+    def without(self, ids: set[int]) -> ObservationEvent:
+        """Return the points that are of none of some landmarks."""
+        if ids.isdisjoint(self.ids.tolist()):
+            return self
+        return self.select(~np.isin(self.ids, list(ids)))
 
 
 Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent

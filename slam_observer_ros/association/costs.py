@@ -39,7 +39,9 @@ def outlier_cost(state: State) -> float:
 def pairing_cost(state: State, m: int, residuals: Residuals) -> float:
     """Return what it costs to take some of m points for the landmarks whose ids they have."""
     r, noise = residuals.on(state.axes)
-    passed, predicted = gated(r, state.filter.predicted(residuals)[1], noise, state.settings)
+    passed, predicted = gated(
+        r, state.filter.predicted(residuals)[1], noise, state.settings.rejection_threshold
+    )
     paired_cost = joint_cost(r[passed], with_blocks(predicted, noise[passed]), noise[passed])
     return paired_cost + (m - int(np.sum(passed))) * outlier_cost(state)
 

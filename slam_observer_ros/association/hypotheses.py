@@ -10,7 +10,7 @@ have ids or are well separated there is nearly always one.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -30,6 +30,7 @@ from slam_observer_ros.association.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.association.new_landmarks import NewLandmarks
+from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.events import (
@@ -42,9 +43,11 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.delay_evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import disbelieve, Outcome, step
+from slam_observer_ros.state.step import disbelieve, step
+from slam_observer_ros.state.usual import Outcome
 
 MOST_WITHOUT_IDS = 2
 """Hypotheses that are followed at most where points have no ids: each costs as much as the first,
@@ -80,6 +83,8 @@ class Hypotheses:
         self._some_have_ids = False
         self._contradictions = Contradictions()
         self._new_landmarks = NewLandmarks()
+        self._standing = Standing()
+        self._velocities: VelocityHistory | None = None  # along which they were moved
         self._delay_evidence = DelayEvidence()
 
     @property
@@ -87,9 +92,10 @@ class Hypotheses:
         """Outcomes for landmarks, in the most likely state and those given up by resets."""
         return self._earlier_counts + self.best.counts
 
-    def count(self, name: str) -> int:
-        """Return one of the :attr:`counts`, without adding up all of them."""
-        return self._earlier_counts.get(name, 0) + self.best.counts.get(name, 0)
+    def some_counts(self, names: Iterable[str]) -> list[int]:
+        """Return some of the :attr:`counts`, without adding up all of them."""
+        earlier, counts = self._earlier_counts, self.best.counts
+        return [earlier.get(name, 0) + counts.get(name, 0) for name in names]
 
     def __len__(self) -> int:
         """Return how many hypotheses there are."""
@@ -157,10 +163,21 @@ class Hypotheses:
         """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns`` (27)."""
         for hypothesis in self._all:
             state = hypothesis.state
-            motion = state.motion(velocities, start_ns, end_ns)
-            state.propagate(motion)
-            if motion.at_ends is not None and state is self.best:
-                self._delay_evidence.add(velocities, motion, start_ns, end_ns)
+            before = state.observer.A.copy()
+            variances = usual.advance(state, velocities, start_ns, end_ns)
+            if variances is None:
+                motion = state.motion(velocities, start_ns, end_ns)
+                state.propagate(motion)
+                variances = np.diagonal(motion.covariances.sum(axis=0))
+            if state is not self.best:
+                continue
+            self._standing.moved.append((before, state.observer.A.copy()))
+            calibration = state.filter.calibration
+            if calibration.delay_error_ns:
+                self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
+        if len(self._standing.moved) > MAX_MOTIONS:
+            self._standing.clear_time()
+        self._velocities = velocities
 
     @property
     def calibration(self) -> list[CalibrationEstimate]:
@@ -176,6 +193,7 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.state.clear_time()
         self._contradictions.clear()
+        self._standing.clear_time()
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
@@ -186,15 +204,51 @@ class Hypotheses:
                 state.remove(row)
         return bool(rows[0][0] >= 0)
 
+    @property
+    def carried_ids(self) -> set[int]:
+        """Landmarks that move with the robot, and are not used."""
+        return self._standing.carried
+
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
+        standing = self._standing
+        if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
+            self._judge(event)
+        if standing.excluded:
+            event = event.without(standing.excluded)
+        return self._observe(event)
+
+    def _judge(self, event: ObservationEvent) -> None:
+        """Stop where the wheels spin, and give up landmarks that the robot carries."""
+        standing, best = self._standing, self.best
+        if not best.filter.has_joint_covariance or self._velocities is None:
+            return
+        was_slipping, were_carried = standing.slip is not None, standing.carried
+        lost = standing.note(best, event, self._velocities)
+        newly = standing.carried - were_carried
+        for hypothesis in self._all:
+            state = hypothesis.state
+            if lost is not None:
+                take_back(state, lost)
+                state.counts['slip'] += not was_slipping
+            if newly:
+                state.counts['carried_landmark'] += len(newly)
+        if best.is_mapping:
+            for landmark_id in newly:
+                self.forget(landmark_id)
+
+    def _observe(self, event: ObservationEvent) -> Outcome:
+        """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
+        if len(self._all) == 1 and (outcome := usual.observe(self.best, event)) is not None:
+            self._some_have_ids = True
+            return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         matches = [match(hypothesis.state, event) for hypothesis in self._all]
+        if self.best.filter.joint is None:
+            return self._observe_alone(event, matches[0])
         if len(self._all) == 1 and not unknown:
-            if not self.best.filter.has_joint_covariance:
-                return self._observe_alone(event, matches[0])
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
             if is_clear and not may_relabel(self.best, matches[0]):
                 return step(self.best, matches[0])

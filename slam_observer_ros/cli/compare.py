@@ -16,21 +16,20 @@ from slam_observer_ros.cli.figures import (
     number_text,
     TRAJECTORY_ROWS,
 )
-from slam_observer_ros.cli.options import add_settings_options, named, named_path
+from slam_observer_ros.cli.options import add_settings_options, named, named_path, read_given
 from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
-from slam_observer_ros.cli.replay.asked import (
+from slam_observer_ros.cli.replay.request import (
     add_run_options,
-    Asked,
-    check_smooth,
-    read_asked,
-    without_outputs,
+    read_request,
+    Records,
+    ReplayRequest,
 )
 from slam_observer_ros.cli.replay.run import replayed, select_inputs
 from slam_observer_ros.cli.replay.summary import as_json, NEARLY_ALL
 from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.plots.drawing import SUFFIXES
-from slam_observer_ros.evaluation.plots.overlay_plot import plot_overlay
+from slam_observer_ros.evaluation.plots.map_plot import plot_overlay
 from slam_observer_ros.evaluation.relative_errors import trajectory_figures
 from slam_observer_ros.evaluation.trajectory import read_tum, Trajectory
 from slam_observer_ros.observer.designs import DESIGNS
@@ -97,41 +96,36 @@ def run(args: argparse.Namespace) -> None:
     check_outputs([args.plot], args.force)
     if len(set(args.what)) < len(args.what):
         raise UsageError('each is compared once')
-    asked = {what: _asked(args, what) for what in args.what}
-    truth = _truth(args, read_asked(args))
-    compared = {what: _compared(args, what, asked[what], truth) for what in args.what}
+    request = read_request(args, read_given(args), args.recording)
+    requests = {what: _request(args, request, what) for what in args.what}
+    truth = _truth(request)
+    compared = {what: _compared(what, requests[what], truth) for what in args.what}
     if args.plot is not None:
         plot_overlay(args.plot, *_in_one_frame(compared, truth))
     _warn_of_parts(compared)
     _print(args, compared)
 
 
-def _asked(args: argparse.Namespace, what: str) -> Asked | None:
-    """Return the settings of one of those that are to be run; None for a trajectory."""
+def _request(args: argparse.Namespace, request: ReplayRequest, what: str) -> ReplayRequest | None:
+    """Return what is to be run for one of those that are compared; None for a trajectory."""
     if what in DESIGNS:
-        asked = read_asked(args)
-        asked = replace(asked, settings=replace(asked.settings, gains=what))
+        request = request.with_values({'gains': what})
     elif Path(what).suffix in TUM_SUFFIXES:
         return None
     else:
-        asked = read_asked(argparse.Namespace(**vars(args) | {'config': what}))
-    check_smooth(args, asked.settings)
-    return asked
+        request = read_request(args, read_given(args, config=what), args.recording)
+    return replace(request, records=Records(poses=True))
 
 
-def _truth(args: argparse.Namespace, asked: Asked) -> Trajectory | None:
-    with Recording(args.recording) as recording:
-        _, _, truth = select_inputs(args, recording, asked)
+def _truth(request: ReplayRequest) -> Trajectory | None:
+    with Recording(request.recording) as recording:
+        _, _, truth = select_inputs(request, recording)
     return Trajectory(truth.stamps_ns, truth.poses) if len(truth.stamps_ns) else None
 
 
-def _compared(
-    args: argparse.Namespace, what: str, asked: Asked | None, truth: Trajectory | None
-) -> Compared:
-    if asked is not None:
-        options = without_outputs(args, args.recording)
-        options.tum = Path(what)  # nothing is written there; all poses are kept for it
-        outcome, _ = replayed(options, asked)
+def _compared(what: str, request: ReplayRequest | None, truth: Trajectory | None) -> Compared:
+    if request is not None:
+        outcome, _ = replayed(request)
         errors = outcome.accuracy.pose_errors
         figures = as_json(outcome) | (
             {} if errors is None or truth is None else trajectory_figures(errors, truth)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slam_observer_ros.cli.interrupts import leaving_at_once, SIGNALLED, stopping_once
+from slam_observer_ros.cli.shell import leaving_at_once, SIGNALLED, stopping_once
 
 with leaving_at_once():
     import argparse
@@ -17,8 +17,8 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
-    from slam_observer_ros.cli.completion import complete, typed_words
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
+    from slam_observer_ros.cli.shell import complete, typed_words
     from slam_observer_ros.common.errors import (
         IncompleteError,
         LossError,
@@ -40,6 +40,7 @@ COMMANDS = {
     'convert': ('convert', 'make a recording of a public data set'),
     'map': ('map', 'make a map file of a map of another program, or check one'),
     'replay': ('replay.command', 'run a recording through the observer'),
+    'calibrate': ('calibrate.command', 'find how sensor and odometry err, by a drive'),
     'tune': ('tune.command', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),
     'doctor': ('doctor', 'say what is installed, and what a node would hear'),

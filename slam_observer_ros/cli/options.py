@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib import metadata
 import json
 import logging
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from slam_observer_ros.cli.completion import completed_by
+from slam_observer_ros.cli.shell import completed_by
 from slam_observer_ros.common.errors import ParameterError, UsageError
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -70,8 +71,38 @@ def add_settings_options(parser: argparse.ArgumentParser, *others: type[Dataclas
     parser.add_argument_group('advanced parameters', advanced)
 
 
-def read_settings(
-    args: argparse.Namespace,
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What ``--config``, ``--set`` and ``--gains`` give: values by name, before they are checked.
+
+    ``config`` has the node's own parameters, too; ``file`` is where it is from.
+    """
+
+    file: Path | None
+    config: Mapping[str, object]
+    assigned: Mapping[str, object]
+    gains: str | None
+
+    @property
+    def values(self) -> dict[str, object]:
+        """All of them, those of ``--set`` in place of others."""
+        return {**self.config, **self.assigned}
+
+
+def read_given(args: argparse.Namespace, config: str | None = None) -> Given:
+    """Read what the options of :func:`add_settings_options` give; ``config`` is for its file."""
+    name = args.config if config is None else config
+    file = None if name is None else find_config(name)
+    return Given(
+        file,
+        {} if file is None else read_parameter_file(file),
+        dict(_parse_assignment(text) for text in args.set),
+        args.gains,
+    )
+
+
+def settings_of(
+    given: Given,
     other_names: Collection[str] = (),
     instead: Mapping[str, str] = MappingProxyType({}),
     **defaults: Value,
@@ -80,30 +111,19 @@ def read_settings(
 
     ``other_names`` are those that ``--set`` takes for other settings of the command; ``instead``
     has the options that do what the node's parameters of these names do. A SlamObserverError is
-    raised if a file, a name or a value is wrong.
+    raised if a name or a value is wrong.
     """
-    values: dict[str, object] = dict(defaults)
-    values |= _for_estimator(read_config(args))
-    for name, value in read_assignments(args).items():
+    values: dict[str, object] = {**defaults, **_for_estimator(given.config)}
+    for name, value in given.assigned.items():
         if name in other_names:
             continue
         if _is_only_for_node(name):
             hint = f'use {instead[name]}' if name in instead else 'of no use here'
             raise UsageError(f"--set {name}: that is the node's parameter; {hint}")
         values[name] = value
-    if args.gains is not None:
-        values['gains'] = args.gains
+    if given.gains is not None:
+        values['gains'] = given.gains
     return from_parameters(Settings, values)
-
-
-def read_config(args: argparse.Namespace) -> dict[str, object]:
-    """Read the parameter file that ``--config`` names, the node's own parameters included."""
-    return {} if args.config is None else read_parameter_file(find_config(args.config))
-
-
-def read_assignments(args: argparse.Namespace) -> dict[str, object]:
-    """Return what ``--set`` sets, by name."""
-    return dict(_parse_assignment(text) for text in args.set)
 
 
 def _is_only_for_node(name: str) -> bool:

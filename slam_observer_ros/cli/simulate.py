@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.cli.console import print_json, print_table, show_progress
-from slam_observer_ros.cli.options import add_settings_options, read_settings, value_of
+from slam_observer_ros.cli.options import add_settings_options, read_given, settings_of, value_of
 from slam_observer_ros.cli.outputs import (
     add_force_option,
     add_result_options,
@@ -93,8 +93,8 @@ def run(args: argparse.Namespace) -> None:
     scenario = _scenario(args)
     # The paper's gains, whatever is the best on real sensors; and each simulated velocity holds
     # until the next one.
-    settings = read_settings(
-        args,
+    settings = settings_of(
+        read_given(args),
         gains='constant',
         velocity_timeout=max(2.0 * args.step, Settings().velocity_timeout),
         max_innovation_time=max(args.step, Settings().max_innovation_time),

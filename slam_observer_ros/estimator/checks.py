@@ -12,13 +12,15 @@ import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimator.event_warnings import EventWarnings
+from slam_observer_ros.estimator.event_warnings import EventWarnings, listed
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
+    FIRST_AUTOMATIC_ID,
     flatten,
     IMPOSSIBLE_ID,
     is_automatic,
+    LAST_AUTOMATIC_ID,
     MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,
@@ -30,6 +32,7 @@ from slam_observer_ros.geometry.matrices import are_covariances, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.known_map.map_file import MAX_NUMBER
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
 from slam_observer_ros.state.landmark_table import LandmarkTable
 
@@ -326,7 +329,7 @@ def _check_definite(name: str, covariances: FloatArray) -> None:
 def usable_points(
     event: ObservationEvent,
     settings: Settings,
-    needs_ids: bool,
+    filter_: Filter,
     landmarks: LandmarkTable,
     counts: Counter[str],
     warnings: EventWarnings,
@@ -334,32 +337,35 @@ def usable_points(
     """Return an observation as the states use it; count its points, warn of those left out."""
     counts['observed_point'] += len(event.ids)
     event = flatten(event) if settings.two_d_mode else event
-    if event.orientations is not None and settings.use_tag_orientation:
-        event = replace(event, orientations=so3.exact(event.orientations))
+    if event.orientations is not None:
+        used = so3.exact(event.orientations) if filter_.estimates_orientations else None
+        event = replace(event, orientations=used)
     if (impossible := event.ids == IMPOSSIBLE_ID).any():
-        warnings.impossible_ids(int(np.sum(impossible)))
+        warnings.warn('impossible_id', count=int(np.sum(impossible)))
         counts['impossible_id'] += int(np.sum(impossible))
         event = event.select(~impossible)
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
-        warnings.reserved_ids(event.ids[reserved].tolist())
+        ids = listed(event.ids[reserved].tolist())
+        warnings.warn('reserved_id', ids=ids, first=FIRST_AUTOMATIC_ID, last=LAST_AUTOMATIC_ID)
         counts['reserved_id'] += int(np.sum(reserved))
         event = event.select(~reserved)
     if repeated_ids := event.repeated_ids():  # nobody knows which of the points is right
-        warnings.repeated_ids(repeated_ids)
+        warnings.warn('repeated_id', ids=listed(repeated_ids))
         repeated = np.isin(event.ids, repeated_ids)
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
     unknown = event.ids == UNKNOWN_ID
-    if needs_ids and np.count_nonzero(unknown):
-        warnings.unknown_ids(settings.gains)
+    can_weigh = filter_.joint is not None
+    if not can_weigh and np.count_nonzero(unknown):
+        warnings.warn('unknown_id', gains=settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)
-    elif not needs_ids and len(event.ids) > MAX_WEIGHED:
+    elif can_weigh and len(event.ids) > MAX_WEIGHED:
         warnings.many_points(len(event.ids))
         if unknown.any() or is_automatic(landmarks.ids).any():
             counts['unweighed_point'] += len(event.ids) - MAX_WEIGHED
-            warnings.unweighed_points(len(event.ids), MAX_WEIGHED)
+            warnings.warn('unweighed_point', count=len(event.ids), most=MAX_WEIGHED)
             event = event.select(_first_weighed(event, unknown))
     return event
 

@@ -23,7 +23,7 @@ from slam_observer_ros.estimator.checks import (
     usable_points,
 )
 from slam_observer_ros.estimator.event_queue import EventQueue
-from slam_observer_ros.estimator.event_warnings import EventWarnings
+from slam_observer_ros.estimator.event_warnings import EventWarnings, UNEXPECTED_POSES
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -44,7 +44,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import Outcome
+from slam_observer_ros.state.usual import Outcome
 
 logger = logging.getLogger(__name__)
 
@@ -229,10 +229,14 @@ class Estimator:
         """
         try:
             check_event(event, self.settings)
-            jumped = self._queue.push(event)
+            passes = self._queue.passes(event)
+            jumped = not passes and self._queue.push(event)
         except InvalidEventError as error:
             self._drop(error)
             return False
+        if passes:  # as nearly always
+            self._process(event)
+            return True
         if jumped:
             self.handle_clock_jump(event.stamp_ns - (self.newest_stamp_ns or 0))
             self._queue.push(event)
@@ -294,10 +298,10 @@ class Estimator:
         made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
         (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
         had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
-        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, ``'merged_landmark'``,
-        ``'doubled_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
-        ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
+        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'carried_landmark'``,
+        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``,
+        ``'merged_landmark'``, ``'doubled_landmark'``) and points not used (``'unknown_id'``,
+        ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
@@ -336,7 +340,7 @@ class Estimator:
         landmark_map = map_of(self._state, self._localiser.loaded if self.is_localised else None)
         has_covariances = landmark_map.covariances is not None
         if has_covariances and landmark_map.joint_covariance is None and not self._state.is_fixed:
-            self._warnings.left_out_correlations(len(landmark_map.ids))
+            self._warnings.warn('left_out_correlations', count=len(landmark_map.ids))
         return landmark_map
 
     @property
@@ -483,7 +487,7 @@ class Estimator:
 
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
-        self._warnings.dropped(error)
+        self._warnings.warn('dropped_message', error.reason, reason=error.reason, error=error)
 
     def _push_velocities(self, velocities: VelocityBlock) -> bool:
         """Put velocities in the queue if none of them needs to be looked at for itself."""
@@ -536,13 +540,12 @@ class Estimator:
             self._counts['velocity'] += 1
         if is_late:
             self._counts['late_velocity'] += 1
-            self._warnings.late_velocity()
+            self._warnings.warn('late_velocity')
 
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings
-        needs_ids = not state.filter.has_joint_covariance
         usable = usable_points(
-            event, self.settings, needs_ids, state.landmarks, self._counts, warnings
+            event, self.settings, state.filter, state.landmarks, self._counts, warnings
         )
         event = self._timeline.synchronise(usable)
         if self._localiser.loaded is not None:
@@ -659,7 +662,7 @@ class Estimator:
         if unused := [name for name in self._state.filter.ignores if name in changed]:
             logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
         filter_ = self._state.filter
-        takes_points = filter_.has_joint_covariance and filter_.orientations is None
+        takes_points = filter_.has_joint_covariance and not filter_.estimates_orientations
         if settings.use_tag_orientation and takes_points:
             logger.warning(
                 'use_tag_orientation has no effect with landmark_velocity_stddev: landmarks are '
@@ -676,10 +679,12 @@ class Estimator:
         warnings, state = self._warnings, self._state
         limit = self.settings.max_landmarks if state.is_mapping else 0
         if 0 < limit < len(event.ids):
-            warnings.more_than_max(len(event.ids), limit)
+            warnings.warn('more_than_max', count=len(event.ids), limit=limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
-        warnings.unexpected_poses(self._hypotheses.count)
+        if carried_ids := self._hypotheses.carried_ids:
+            warnings.carried_landmarks(carried_ids)
+        warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
         warnings.large_map(len(state.landmarks), limit, is_dense)

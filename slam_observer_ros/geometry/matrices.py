@@ -199,3 +199,10 @@ def with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArray
     variances, U = np.linalg.eigh(symmetric(covariances))
     clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ transpose(U)
     return clipped
+
+
+def correlations_of(covariance: FloatArray) -> FloatArray:
+    """Return the correlations (d, d) of a covariance without zeros on its diagonal."""
+    deviations = np.sqrt(np.diagonal(covariance))
+    correlations: FloatArray = covariance / np.outer(deviations, deviations)
+    return correlations

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 import logging
 from typing import TypeAlias
 
 from slam_observer_ros.common.errors import InvalidEventError, TransformError
 from slam_observer_ros.common.units import to_ns
-from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityEvent
+from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.pose_differences import PoseDifferences
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.measurement import AnyMeasurement, Measurement
-from slam_observer_ros.messages.poses_and_velocities import PoseMessage
+from slam_observer_ros.messages.poses import PoseMessage
 
 MAX_WAITING = 1000
 """Most measurements that wait for a transform; the oldest go first."""
@@ -23,8 +21,8 @@ MAX_WAITING = 1000
 NO_TRANSFORM = 'no_transform'
 """Reason under which measurements are dropped that can't be brought into the base frame."""
 
-_InFrame: TypeAlias = AnyMeasurement | TagDetections
-Measured: TypeAlias = _InFrame | PoseMessage
+Measured: TypeAlias = Event | PoseMessage
+"""What a message measures, in the frame that it names."""
 
 DropError: TypeAlias = TransformError | InvalidEventError
 """Why a measurement makes no event."""
@@ -32,22 +30,15 @@ DropError: TypeAlias = TransformError | InvalidEventError
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class _Waiting:
-    """A measurement whose transform is not known yet."""
-
-    deadline_ns: int
-    measured: _InFrame
-
-
 def with_receive_time(measured: Measured, receive_stamp_ns: int) -> Measured:
     """Return a measurement with the time of its reception if its publisher left the stamp out.
 
     Fiducials keep theirs, which /tf has as well. Where time begins at zero, zero is a stamp.
     """
-    if receive_stamp_ns == 0 or isinstance(measured, TagDetections) or measured.stamp_ns:
+    is_of_tags = isinstance(measured, ObservationEvent) and measured.families is not None
+    if receive_stamp_ns == 0 or is_of_tags or measured.stamp_ns:
         return measured
-    return measured.with_stamp(receive_stamp_ns)
+    return replace(measured, stamp_ns=receive_stamp_ns)
 
 
 def drop_reason(error: DropError) -> str:
@@ -75,7 +66,8 @@ class EventBuilder:
         self._transform_timeout_ns = to_ns(transform_timeout_s)
         self._on_drop = on_drop
         self._poses = PoseDifferences(to_ns(velocity_timeout_s))
-        self._waiting: deque[tuple[_Waiting, TransformError]] = deque()
+        # With the time until which each waits, and what it waits for.
+        self._waiting: deque[tuple[Event, int, TransformError]] = deque()
         self._taken_as_base: dict[str, tuple[int, VelocityEvent]] = {}
 
     @property
@@ -93,8 +85,8 @@ class EventBuilder:
             velocity = self._difference(measured)
             if velocity is None:
                 return []
-            measured = Measurement(measured.child_frame_id, velocity)
-        return self._attempt(_Waiting(now_ns + self._transform_timeout_ns, measured), now_ns)
+            measured = replace(velocity, sensor_frame=measured.child_frame_id)
+        return self._attempt(measured, now_ns + self._transform_timeout_ns, now_ns)
 
     def passes_on(self, frame_id: str) -> bool:
         """Return whether velocities in a frame become events as they are, and nothing waits."""
@@ -104,12 +96,20 @@ class EventBuilder:
     def retry(self, now_ns: int) -> list[Event]:
         """Return the events of what has waited long enough, or for what is known by now."""
         waiting, self._waiting = self._waiting, deque()
-        return [event for item, _ in waiting for event in self._attempt(item, now_ns)]
+        return [
+            event
+            for measured, deadline_ns, _ in waiting
+            for event in self._attempt(measured, deadline_ns, now_ns)
+        ]
 
     def finish(self) -> list[Event]:
         """Return the events of what still waits, when nothing more will come."""
         waiting, self._waiting = self._waiting, deque()
-        return [event for item, _ in waiting for event in self._attempt(item, item.deadline_ns)]
+        return [
+            event
+            for measured, deadline_ns, _ in waiting
+            for event in self._attempt(measured, deadline_ns, deadline_ns)
+        ]
 
     def clear(self) -> None:
         """Drop what waits, as after a jump of the clock."""
@@ -123,40 +123,37 @@ class EventBuilder:
             self._on_drop(error)
             return None
 
-    def _attempt(self, item: _Waiting, now_ns: int) -> list[Event]:
+    def _attempt(self, measured: Event, deadline_ns: int, now_ns: int) -> list[Event]:
         try:
-            event: Event | None = self._event(item.measured, now_ns)
+            return [self._event(measured, now_ns)]
         except TransformError as error:
-            if now_ns < item.deadline_ns:
-                self._wait(item, error)
+            if now_ns < deadline_ns:
+                self._wait(measured, deadline_ns, error)
                 return []
-            event = self._give_up(item, error)
-        return [] if event is None else [event]
+            return self._give_up(measured, deadline_ns, error)
 
-    def _wait(self, item: _Waiting, error: TransformError) -> None:
+    def _wait(self, measured: Event, deadline_ns: int, error: TransformError) -> None:
         if len(self._waiting) == MAX_WAITING:
-            _, reason = self._waiting.popleft()
+            *_, reason = self._waiting.popleft()
             text = f'more than {MAX_WAITING} measurements wait for their transforms: {reason}'
             self._on_drop(TransformError(text))
-        self._waiting.append((item, error))
+        self._waiting.append((measured, deadline_ns, error))
 
-    def _event(self, measured: _InFrame, now_ns: int) -> Event:
-        if isinstance(measured, TagDetections):
-            return self._base_frame.tags(measured)
-        event, frame_id = measured.event, measured.frame_id
-        if isinstance(event, VelocityEvent):
-            is_of_base = self._is_taken_as_base(event, frame_id, now_ns)
-            return event if is_of_base else self._base_frame.velocity(event, frame_id)
-        if isinstance(event, AngularVelocityEvent):
-            return self._base_frame.angular_velocity(event, frame_id)
-        return self._base_frame.observation(event, frame_id)
+    def _event(self, measured: Event, now_ns: int) -> Event:
+        if isinstance(measured, ObservationEvent):
+            return self._base_frame.observation(measured)
+        if isinstance(measured, VelocityEvent):
+            is_of_base = self._is_taken_as_base(measured, now_ns)
+            return measured if is_of_base else self._base_frame.velocity(measured)
+        return self._base_frame.angular_velocity(measured)
 
-    def _is_taken_as_base(self, event: VelocityEvent, frame_id: str, now_ns: int) -> bool:
+    def _is_taken_as_base(self, event: VelocityEvent, now_ns: int) -> bool:
         """Return whether velocities of this frame still do not wait for their transform.
 
         As one that moves comes after the velocities of its time, it is one of these that is looked
         up, for as long as it would have waited, and then the next one.
         """
+        frame_id = event.sensor_frame
         if frame_id not in self._taken_as_base:
             return False
         deadline_ns, looked_up = self._taken_as_base[frame_id]
@@ -164,7 +161,7 @@ class EventBuilder:
             deadline_ns, looked_up = now_ns + self._transform_timeout_ns, event
             self._taken_as_base[frame_id] = deadline_ns, looked_up
         try:
-            self._base_frame.velocity(looked_up, frame_id)
+            self._base_frame.velocity(looked_up)
         except TransformError:
             return True
         del self._taken_as_base[frame_id]
@@ -175,18 +172,16 @@ class EventBuilder:
         )
         return False
 
-    def _give_up(self, item: _Waiting, error: TransformError) -> Event | None:
-        measured = item.measured
-        if isinstance(measured, TagDetections) or not isinstance(measured.event, VelocityEvent):
+    def _give_up(self, measured: Event, deadline_ns: int, error: TransformError) -> list[Event]:
+        if not isinstance(measured, VelocityEvent):
             self._on_drop(error)
-            return None
-        event = measured.event
-        self._taken_as_base[measured.frame_id] = item.deadline_ns, event
+            return []
+        self._taken_as_base[measured.sensor_frame] = deadline_ns, measured
         logger.warning(
             "Velocities in frame '%s' are taken to be those of '%s' until their transform is "
             'known: %s',
-            measured.frame_id,
+            measured.sensor_frame,
             self._base_frame.name,
             error,
         )
-        return event
+        return [measured]

@@ -13,8 +13,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
+from slam_observer_ros.messages.poses import pose_stack, PoseMessage
 from slam_observer_ros.settings.input_settings import InputSettings, Pose6
 
 OPTICAL = 'optical'
@@ -63,12 +62,15 @@ class BaseFrame:
         self._tag_frame_prefix = settings.tag_frame_prefix
         self._sensor_pose = _sensor_pose(settings.sensor_pose)
 
-    def observation(self, event: ObservationEvent, frame_id: str) -> ObservationEvent:
+    def observation(self, event: ObservationEvent) -> ObservationEvent:
         """Return landmarks in the base frame; those measured in the map's frame are refused.
 
-        Its ``sensor_frame`` is '' where they were measured in the base frame itself.
+        Its ``sensor_frame`` is '' where they were measured in the base frame itself. Fiducials
+        are where /tf has them in the camera's frame.
         """
-        frame_id = self._sensor_frame or frame_id
+        frame_id = self._sensor_frame or event.sensor_frame
+        if event.families is not None:
+            event = self._placed_tags(event, event.families, frame_id)
         plain = frame_id.lstrip('/')
         axis = _ALONG_Z if OPTICAL in plain else _ALONG_X
         event = replace(event, sensor_frame='' if plain == self.name else plain, sensor_axis=axis)
@@ -77,34 +79,33 @@ class BaseFrame:
         self._refuse_map_frame(frame_id)
         return self._moved(event, frame_id)
 
-    def tags(self, detections: TagDetections) -> ObservationEvent:
-        """Return where /tf has the fiducials of a detection message, in the base frame."""
-        camera_frame = self._sensor_frame or detections.frame_id
-        self._refuse_map_frame(camera_frame)
-        found = [
-            self._tag_pose(camera_frame, family, number, detections.stamp_ns)
-            for family, number in zip(detections.families, detections.ids, strict=True)
-        ]
-        ids, poses = np.array(detections.ids, dtype=np.int64), np.array(found).reshape(-1, 4, 4)
-        R = poses[:, :3, :3]
-        R[(np.eye(3) == R).all(axis=(1, 2))] = 0.0  # unknown, as where nobody filled it in
-        event = ObservationEvent(detections.stamp_ns, ids, poses[:, :3, 3], orientations=R)
-        return self.observation(event, camera_frame)
-
-    def velocity(self, event: VelocityEvent, frame_id: str) -> VelocityEvent:
+    def velocity(self, event: VelocityEvent) -> VelocityEvent:
         """Return the velocity of the base, given that of a frame that moves with the robot."""
-        if frame_id.lstrip('/') in self._world_frames:
-            raise TransformError(f"'{frame_id}' does not move with the robot")
-        return self._moved(event, frame_id)
+        if event.sensor_frame.lstrip('/') in self._world_frames:
+            raise TransformError(f"'{event.sensor_frame}' does not move with the robot")
+        return self._moved(event, event.sensor_frame)
 
     def is_base(self, frame_id: str) -> bool:
         """Return whether velocities in a frame are those of the base as they are."""
         plain = frame_id.lstrip('/')
         return plain in ('', self.name) and plain not in self._world_frames
 
-    def angular_velocity(self, event: AngularVelocityEvent, frame_id: str) -> AngularVelocityEvent:
+    def angular_velocity(self, event: AngularVelocityEvent) -> AngularVelocityEvent:
         """Return an angular velocity in the base frame's axes."""
-        return self._moved(event, frame_id)
+        return self._moved(event, event.sensor_frame)
+
+    def _placed_tags(
+        self, event: ObservationEvent, families: tuple[str, ...], camera_frame: str
+    ) -> ObservationEvent:
+        self._refuse_map_frame(camera_frame)
+        found = [
+            self._tag_pose(camera_frame, family, number, event.stamp_ns)
+            for family, number in zip(families, event.ids.tolist(), strict=True)
+        ]
+        poses = np.array(found).reshape(-1, 4, 4)
+        R = poses[:, :3, :3]
+        R[(np.eye(3) == R).all(axis=(1, 2))] = 0.0  # unknown, as where nobody filled it in
+        return replace(event, points=poses[:, :3, 3], orientations=R, families=None)
 
     def _refuse_map_frame(self, frame_id: str) -> None:
         """Refuse landmarks that the estimate itself would bring to where it has them."""

@@ -10,7 +10,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.messages.poses_and_velocities import PoseMessage
+from slam_observer_ros.messages.poses import PoseMessage
 
 MAX_PAUSE_S = 1.0  # between two messages: how the robot moved meanwhile no twist says
 WAY_M, TURN_RAD = 0.1, 0.3  # length of a stretch over which both are compared

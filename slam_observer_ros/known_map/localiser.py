@@ -18,7 +18,7 @@ from slam_observer_ros.known_map.places import Place
 from slam_observer_ros.known_map.tag_pose import pose_by_tag, TagPose
 from slam_observer_ros.known_map.unexplained import Unexplained
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import Outcome
+from slam_observer_ros.state.usual import Outcome
 
 logger = logging.getLogger(__name__)
 

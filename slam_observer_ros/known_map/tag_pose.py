@@ -30,7 +30,7 @@ class TagPose:
 def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> TagPose | None:
     """Return the pose in a map by the tag that says it best, but for ``refused`` ids; or None."""
     tags, R, sigmas = state.filter.orientations, known.orientations, known.orientation_sigmas
-    if tags is None or R is None or sigmas is None:
+    if R is None or sigmas is None:
         return None
     # Tags that both have, and that were seen the same way each time.
     rows, landmarks = state.landmarks.rows_of(known.ids), state.landmarks
@@ -48,7 +48,7 @@ def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> 
         return None
     at, row, A = shared[best], own[best : best + 1], state.observer.A
     # From the frame of P° to the map: by how the tag is turned, and where it is.
-    turn = R[at] @ tags.B[row[0]].T
+    turn = R[at] @ state.filter.orientation_matrices(row)[0].T
     lever = turn @ (A[:3, 3] - state.filter.points[row[0]])
     pose = se3.pose(turn @ A[:3, :3], known.world_points[at] + lever)
     # An error of the tag's turn moves the robot about it.

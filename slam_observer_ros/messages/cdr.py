@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 import struct
-from typing import Any, TypeAlias
+from typing import Any, cast, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,8 @@ from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 """One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""
+
+ReadT = TypeVar('ReadT')
 
 ENCAPSULATION_BYTES = 4
 MAX_PADDING_BYTES = 3
@@ -31,16 +35,18 @@ class CdrReader:
     """Cursor over one message with its 4-byte encapsulation header, little or big endian.
 
     Every read checks that the bytes are there; bytes that are not plain CDR raise a MessageError.
+    ``receive_ns`` is when the message was received, nanoseconds.
     """
 
-    __slots__ = ('_byte_order', '_position', '_raw')
+    __slots__ = ('_byte_order', '_position', '_raw', 'receive_ns')
 
-    def __init__(self, raw: Buffer) -> None:
+    def __init__(self, raw: Buffer, receive_ns: int = 0) -> None:
         if len(raw) < ENCAPSULATION_BYTES:
             raise MessageError(f'too short: {len(raw)} bytes hold no CDR header')
         if raw[0] != 0 or raw[1] > 1:
             raise MessageError(f'not plain CDR: encapsulation {bytes(raw[:2]).hex()}')
         self._raw = raw
+        self.receive_ns = receive_ns
         self._position = ENCAPSULATION_BYTES
         self._byte_order = '<' if raw[1] else '>'
 
@@ -94,30 +100,21 @@ class CdrReader:
 
     def int64(self, count: int) -> IntArray:
         """Read ``count`` int64 values, shape (count,)."""
-        if count == 0:  # CDR puts no alignment bytes before an empty sequence.
-            return np.zeros(0, dtype=np.int64)
-        start = self._take(8 * count, alignment=8)
-        return np.frombuffer(self._raw, _INT64[self._byte_order], count, start).astype(np.int64)
+        return self._numbers(_INT64[self._byte_order], count).astype(np.int64)
 
     def float64(self, count: int) -> FloatArray:
         """Read ``count`` float64 values, shape (count,)."""
-        return self._array(_FLOAT64[self._byte_order], count, alignment=8)
+        return _quiet(self._numbers(_FLOAT64[self._byte_order], count))
 
     def float32(self, count: int) -> FloatArray:
         """Read ``count`` float32 values as float64, shape (count,)."""
-        return self._array(_FLOAT32[self._byte_order], count, alignment=4)
+        return _quiet(self._numbers(_FLOAT32[self._byte_order], count))
 
-    def _array(
-        self, dtype: np.dtype[np.float32] | np.dtype[np.float64], count: int, alignment: int
-    ) -> FloatArray:
+    def _numbers(self, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
         if count == 0:  # CDR puts no alignment bytes before an empty sequence.
-            return np.zeros(0)
-        start = self._take(count * dtype.itemsize, alignment)
-        values = np.frombuffer(self._raw, dtype, count, start)
-        with np.errstate(invalid='ignore'):  # Any bits may be there, signalling NaNs, too:
-            # a product, unlike a copy, makes them quiet for whoever reads them next.
-            quiet: FloatArray = np.multiply(values, 1.0, dtype=np.float64)
-        return quiet
+            return np.zeros(0, dtype)
+        start = self._take(count * dtype.itemsize, dtype.itemsize)
+        return np.frombuffer(self._raw, dtype, count, start)
 
     def data(self, size: int) -> memoryview:
         """Read ``size`` bytes without copying them."""
@@ -132,50 +129,73 @@ class CdrReader:
 
 
 class CdrBlockReader(CdrReader):
-    """Cursor over k messages of one size (k, size), as :class:`CdrReader` is over the first.
+    """Cursor over k messages of one size (k, size), as :class:`CdrReader` is over one.
 
-    They must have the strings in common that are read: else a MessageError is raised.
+    Stamps are (k,), arrays (k, count), and times of reception (k,). All else that is read must be
+    the same in all messages: else a MessageError is raised.
     """
 
     __slots__ = ('_rows',)
 
-    def __init__(self, rows: NDArray[np.uint8]) -> None:
-        super().__init__(rows[0].tobytes())
+    def __init__(self, rows: NDArray[np.uint8], receive_ns: IntArray) -> None:
+        super().__init__(rows[0].tobytes(), cast('int', receive_ns))
         self._rows = rows
         self._check_common(0, 2)
 
-    def headers(self) -> tuple[IntArray, str]:
-        """Read headers: stamps (k,) in nanoseconds, and their frame id."""
-        times = self._columns(2, np.dtype(np.uint32), alignment=4)
+    def stamp_ns(self) -> Any:
+        """Read builtin_interfaces/Time as nanoseconds (k,)."""
+        times = self._numbers(np.dtype(f'{self._byte_order}u4'), 2)
         if (times[:, 1] >= NANOSECONDS_PER_SECOND).any():
             raise MessageError('a stamp with too much in its nanosecond field')
         seconds = times[:, 0].astype(np.int32).astype(np.int64)
-        return seconds * NANOSECONDS_PER_SECOND + times[:, 1].astype(
-            np.int64
-        ), self.common_string()
+        return seconds * NANOSECONDS_PER_SECOND + times[:, 1].astype(np.int64)
 
-    def common_string(self) -> str:
+    def uint8(self) -> int:
+        """Read a byte that is the same in all messages."""
+        return self._common(super().uint8)
+
+    def uint16(self) -> int:
+        """Read a uint16 that is the same in all messages."""
+        return self._common(super().uint16)
+
+    def int32(self) -> int:
+        """Read an int32 that is the same in all messages."""
+        return self._common(super().int32)
+
+    def uint32(self) -> int:
+        """Read a uint32 that is the same in all messages."""
+        return self._common(super().uint32)
+
+    def string(self) -> str:
         """Read a string that is the same in all messages."""
+        return self._common(super().string)
+
+    def data(self, size: int) -> memoryview:
+        """Read bytes that are the same in all messages."""
+        return self._common(partial(super().data, size))
+
+    def _numbers(self, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
+        if count == 0:
+            return np.zeros((len(self._rows), 0), dtype)
+        start = self._take(count * dtype.itemsize, dtype.itemsize)
+        return np.ascontiguousarray(self._rows[:, start : self._position]).view(dtype)
+
+    def _common(self, read: Callable[[], ReadT]) -> ReadT:
         begin = self._position
-        text = self.string()
+        value = read()
         self._check_common(begin, self._position)
-        return text
-
-    def float64s(self, count: int) -> FloatArray:
-        """Read ``count`` float64 values of each message, (k, count)."""
-        values = self._columns(count, np.dtype(np.float64), alignment=8)
-        with np.errstate(invalid='ignore'):  # as in _array
-            quiet: FloatArray = np.multiply(values, 1.0, dtype=np.float64)
-        return quiet
-
-    def _columns(self, count: int, dtype: np.dtype[Any], alignment: int) -> NDArray[Any]:
-        start = self._take(count * dtype.itemsize, alignment)
-        columns = np.ascontiguousarray(self._rows[:, start : self._position])
-        return columns.view(dtype.newbyteorder('<' if self._byte_order == '<' else '>'))
+        return value
 
     def _check_common(self, begin: int, end: int) -> None:
         if (self._rows[:, begin:end] != self._rows[0, begin:end]).any():
             raise MessageError('a string, or the byte order, is not the same in all messages')
+
+
+def _quiet(values: NDArray[Any]) -> FloatArray:
+    """Return values as float64 without signalling NaNs, for whoever reads them next."""
+    with np.errstate(invalid='ignore'):  # Any bits may be there; a product, unlike a copy,
+        quiet: FloatArray = np.multiply(values, 1.0, dtype=np.float64)  # makes them quiet.
+    return quiet
 
 
 def encode_string(text: str) -> bytes:

@@ -6,7 +6,7 @@ Messages are read from their bytes, so that none of the packages that define the
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 import re
 
@@ -15,11 +15,15 @@ import numpy as np
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.cloud_fields import skip_cloud
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.observed_poses import observed_poses, orientations_of
-from slam_observer_ros.messages.poses_and_velocities import PoseMessage
+from slam_observer_ros.messages.fiducials import NESTED, observed_poses, orientations_of
+from slam_observer_ros.messages.poses import PoseMessage
+from slam_observer_ros.messages.registry import Decoder, reads
+
+APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'  # ids of fiducials that /tf has
+POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
+DETECTIONS = 'vision_msgs/msg/Detection3DArray'
 
 _POSE = 7
 _COVARIANCE = 36
@@ -34,79 +38,86 @@ _HASH = re.compile(r'(?<![^\W_])(?=.*\d[a-f])[\da-f-]{8,}\Z', re.IGNORECASE)
 _HASH_LENGTH = 64  # no more of a name is searched: that takes the square of the length
 
 
-@dataclass(frozen=True, slots=True)
-class TagDetections:
-    """Fiducials, of families such as ``tag36h11``, that a camera has seen; /tf has their poses."""
+@reads(
+    APRILTAGS,
+    role='landmarks',
+    package='apriltag_ros',
+    definition=(
+        'std_msgs/Header header\nAprilTagDetection[] detections\n'
+        f'{NESTED}apriltag_msgs/AprilTagDetection\nstring family\nint32 id\nint32 hamming\n'
+        'float32 goodness\nfloat32 decision_margin\nPoint centre\nPoint[4] corners\n'
+        f'float64[9] homography\n{NESTED}apriltag_msgs/Point\nfloat64 x\nfloat64 y\n'
+    ),
+)
+def decode_apriltags(reader: CdrReader) -> ObservationEvent:
+    """Read an apriltag_msgs/AprilTagDetectionArray: which fiducials are seen; /tf has where."""
+    stamp_ns, frame_id = reader.header()
+    tags = [_read_apriltag(reader) for _ in range(reader.uint32())]
+    ids = np.array([number for number, _ in tags], dtype=np.int64)
+    families = tuple(name for _, name in tags)
+    unknown = np.full((len(tags), 3), np.nan)
+    return ObservationEvent(stamp_ns, ids, unknown, sensor_frame=frame_id, families=families)
 
-    stamp_ns: int
-    frame_id: str
-    ids: tuple[int, ...]
-    families: tuple[str, ...]
 
-
-def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
-    """Decode a geometry_msgs/PoseArray, whose landmarks have no ids."""
-    reader = CdrReader(raw)
+@reads(POSE_ARRAY, role='landmarks', is_ambiguous=True)
+def decode_pose_array(reader: CdrReader) -> ObservationEvent:
+    """Read a geometry_msgs/PoseArray, whose landmarks have no ids."""
     stamp_ns, frame_id = reader.header()
     poses = reader.float64(_POSE * reader.uint32()).reshape(-1, _POSE)
-    reader.finish()
     ids = np.full(len(poses), UNKNOWN_ID, dtype=np.int64)
     return observed_poses(frame_id, stamp_ns, ids, poses)
 
 
-def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
-    """Decode a vision_msgs/Detection3DArray, since ROS 2 Galactic.
+@reads(
+    DETECTIONS,
+    role='landmarks',
+    definition=(
+        'std_msgs/Header header\nDetection3D[] detections\n'
+        f'{NESTED}vision_msgs/Detection3D\nstd_msgs/Header header\n'
+        'ObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n'
+        f'{NESTED}vision_msgs/ObjectHypothesisWithPose\n'
+        'ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
+        f'{NESTED}vision_msgs/ObjectHypothesis\nstring class_id\nfloat64 score\n'
+        f'{NESTED}vision_msgs/BoundingBox3D\n'
+        'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n'
+    ),
+)
+def decode_detections(reader: CdrReader) -> ObservationEvent:
+    """Read a vision_msgs/Detection3DArray, since ROS 2 Galactic.
 
     The id of a landmark is the number that ends its detection's ``id``, or else its first
     result's ``class_id``: both are strings. No id are UUIDs, hashes, and numbers beyond
     ``MAX_ID``, as trackers give them. Its pose, with covariance if it is known of all, is that
     result's, or else, if that is missing or zero, that of the centre of the box.
     """
-    return _decode_detections(raw, ('id',))
+    return _read_detections(reader, ('id',))
 
 
-def decode_foxy_detections(
-    raw: Buffer, _receive_stamp_ns: int = 0
-) -> Measurement[ObservationEvent]:
-    """Decode a vision_msgs/Detection3DArray of ROS 2 Dashing to Foxy, with ``tracking_id``."""
-    return _decode_detections(raw, ('source_cloud', 'is_tracking', 'tracking_id'))
-
-
-def decode_ros1_detections(
-    raw: Buffer, _receive_stamp_ns: int = 0
-) -> Measurement[ObservationEvent]:
-    """Decode a vision_msgs/Detection3DArray of ROS 1, whose classes are numbers, made CDR."""
-    return _decode_detections(raw, ('source_cloud',), has_numbers=True)
-
-
-def _decode_detections(
-    raw: Buffer, rest: Sequence[str], has_numbers: bool = False
-) -> Measurement[ObservationEvent]:
-    """Decode detections with these fields behind their box."""
-    reader = CdrReader(raw)
+def _read_detections(
+    reader: CdrReader, rest: Sequence[str], has_numbers: bool = False
+) -> ObservationEvent:
+    """Read detections with these fields behind their box."""
     stamp_ns, frame_id = reader.header()
     detections = [_read_detection(reader, rest, has_numbers) for _ in range(reader.uint32())]
-    reader.finish()
     ids = np.array([landmark_id for landmark_id, _, _ in detections], dtype=np.int64)
     poses = np.array([pose for _, pose, _ in detections]).reshape(-1, _POSE)
     covariances = np.array([covariance for _, _, covariance in detections]).reshape(-1, 6, 6)
     return observed_poses(frame_id, stamp_ns, ids, poses, covariances)
 
 
-def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:
-    """Decode an apriltag_msgs/AprilTagDetectionArray."""
-    reader = CdrReader(raw)
-    stamp_ns, frame_id = reader.header()
-    tags = [_read_apriltag(reader) for _ in range(reader.uint32())]
-    reader.finish()
-    return TagDetections(
-        stamp_ns, frame_id, tuple(number for number, _ in tags), tuple(name for _, name in tags)
+OTHER_DETECTIONS: dict[tuple[str, ...], tuple[str, Decoder[ObservationEvent]]] = {
+    fields: (release, Decoder(partial(_read_detections, rest=fields, has_numbers=has_numbers)))
+    for release, fields, has_numbers in (
+        ('Foxy', ('source_cloud', 'is_tracking', 'tracking_id'), False),
+        ('ROS 1', ('source_cloud',), True),  # whose classes are numbers
     )
+}
+"""Releases of vision_msgs until ROS 2 Foxy, by what is behind the box of a detection."""
 
 
 def observed_tags(
     transforms: Iterable[PoseMessage], tag_frame_prefix: str
-) -> list[Measurement[ObservationEvent]]:
+) -> list[ObservationEvent]:
     """Return what of /tf are sightings of fiducials: transforms from a camera to a tag.
 
     A tag's frame is the prefix and its id, or, as apriltag_ros has it, ``family:id``. Those that
@@ -160,11 +171,11 @@ def _camera_and_stamp(sighting: tuple[PoseMessage, int]) -> tuple[str, int]:
 
 def _observation(
     frame_id: str, stamp_ns: int, sightings: Sequence[tuple[PoseMessage, int]]
-) -> Measurement[ObservationEvent]:
+) -> ObservationEvent:
     ids = np.array([landmark_id for _, landmark_id in sightings], dtype=np.int64)
     points = np.array([message.position for message, _ in sightings])
     R = orientations_of(np.array([message.quaternion for message, _ in sightings]))
-    return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points, orientations=R))
+    return ObservationEvent(stamp_ns, ids, points, orientations=R, sensor_frame=frame_id)
 
 
 def _read_detection(

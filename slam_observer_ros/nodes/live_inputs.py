@@ -5,12 +5,11 @@ The program of ``slam-observer doctor``: ``python -m slam_observer_ros.nodes.liv
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 import json
 import sys
 import time
-from typing import Any
 
 import numpy as np
 import rclpy
@@ -20,18 +19,11 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.messages.detections import decode_apriltags, observed_tags
-from slam_observer_ros.messages.message_types import (
-    APRILTAGS,
-    CLOUD_DECODERS,
-    DETECTION_DECODERS,
-    IMU,
-    TRANSFORMS,
-    VELOCITY_DECODERS,
-)
-from slam_observer_ros.messages.poses_and_velocities import decode_imu, decode_transforms
+from slam_observer_ros.messages.detections import observed_tags
+from slam_observer_ros.messages.poses import decode_transforms, TRANSFORMS
 from slam_observer_ros.nodes.message_classes import message_class
 from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.message_types import message_types, MessageType, Role
 
 DISCOVERY_S = 1.0
 """Time after which publishers have been found, unless an announcement was lost."""
@@ -39,21 +31,17 @@ DISCOVERY_S = 1.0
 LOOK_PERIOD_S = 0.25
 """How often those are looked for whose announcement comes later: DDS repeats it after 3 s."""
 
-ROLES: dict[str, tuple[str, str]] = {
-    **dict.fromkeys(VELOCITY_DECODERS, ('twist', '')),
-    IMU: ('imu', 'use_imu:=true'),
-    **dict.fromkeys((*CLOUD_DECODERS, *DETECTION_DECODERS, APRILTAGS), ('landmarks', '')),
-    TRANSFORMS: ('/tf', ''),
+INPUTS: dict[Role, tuple[str, str]] = {
+    'velocity': ('twist', ''),
+    'angular velocity': ('imu', 'use_imu:=true'),
+    'landmarks': ('landmarks', ''),
 }
-"""Types of messages: the node's topic for them, and what has to be set."""
+"""By what is read: the node's topic for it, and what has to be set."""
 
-_DECODERS: dict[str, Callable[[bytes, int], Any]] = {
-    **VELOCITY_DECODERS,
-    IMU: decode_imu,
-    **CLOUD_DECODERS,
-    **DETECTION_DECODERS,
-    APRILTAGS: decode_apriltags,
-}
+
+def _read_types() -> dict[str, MessageType]:
+    """Return what the node reads, but for transforms."""
+    return {name: known for role in INPUTS for name, known in message_types(role).items()}
 
 
 @dataclass
@@ -71,8 +59,9 @@ class HeardTopic:
     @property
     def role(self) -> str:
         """The node's topic for this one."""
-        is_static = self.type_name == TRANSFORMS and self.name.endswith('/tf_static')
-        return '/tf_static' if is_static else ROLES[self.type_name][0]
+        if self.type_name == TRANSFORMS:
+            return '/tf_static' if self.name.endswith('/tf_static') else '/tf'
+        return INPUTS[_read_types()[self.type_name].role][0]
 
     @property
     def rate_hz(self) -> float:
@@ -85,11 +74,12 @@ class HeardTopic:
         self.last = raw
         if self.type_name == TRANSFORMS:
             for seen in observed_tags(decode_transforms(raw), InputSettings.tag_frame_prefix):
-                self.fiducials |= set(seen.event.ids.tolist())
+                self.fiducials |= set(seen.ids.tolist())
 
     def text(self) -> str:
         """Say what comes at which rate, and how the node gets it."""
-        role, setting = self.role, ROLES[self.type_name][1]
+        role = self.role
+        setting = next((needed for name, needed in INPUTS.values() if name == role), '')
         remapping = '' if self.name == f'/{role.lstrip("/")}' else f'-r {role}:={self.name}'
         needed = ' '.join(part for part in (remapping, setting and f'-p {setting}') if part)
         rate = f'{self.rate_hz:.1f} Hz' if self.messages else 'no message'
@@ -100,15 +90,14 @@ class HeardTopic:
     def _content(self) -> str:
         if self.fiducials:
             return f'{len(self.fiducials)} fiducials, as landmarks with -p landmarks_type:=tf'
-        decode = _DECODERS.get(self.type_name)
-        if not self.messages or decode is None:
+        known = _read_types().get(self.type_name)
+        if not self.messages or known is None:
             return ''
         try:
-            measurement = decode(self.last, time.time_ns())
+            event = known.decode(self.last, time.time_ns())
         except MessageError as error:
             return f"can't be used: {error}"
-        frame = f"in '{measurement.frame_id}'" if measurement.frame_id else 'without a frame'
-        event = getattr(measurement, 'event', None)
+        frame = f"in '{event.sensor_frame}'" if event.sensor_frame else 'without a frame'
         if not isinstance(event, ObservationEvent):
             return frame
         named = int(np.count_nonzero(event.ids != UNKNOWN_ID))
@@ -161,9 +150,10 @@ def _listen(node: Node, executor: SingleThreadedExecutor, seconds: float) -> lis
 
 def _usable_topics(node: Node) -> Iterator[tuple[str, str]]:
     """Yield the topics, and their types, that somebody publishes and the node reads."""
+    read = _read_types()
     for name, types in node.get_topic_names_and_types():
         for type_name in types:
-            if type_name in ROLES and node.count_publishers(name):
+            if type_name in (*read, TRANSFORMS) and node.count_publishers(name):
                 yield name, type_name
 
 

@@ -72,10 +72,12 @@ class Observer(FilterArrays):
         self.A[...] = D.dot(self.A)  # (28), Δ for a finite time
         self.a[rows] = self.a[rows].dot(D[:3, :3].T) + d  # (28), δ_i
 
-    def correct_velocities(self, D: FloatArray, change: FloatArray) -> None:
-        """Turn the landmarks' velocities by D (4, 4), and add ``change`` (n, 3), m/s."""
-        self.u[...] = se3.rotate(D, self.u) + change
-        self.have_moved = True
+    def correct_velocities(
+        self, D: FloatArray, rows: IntArray | slice, change: FloatArray
+    ) -> None:
+        """Turn the velocities of landmarks by D (4, 4), and add ``change`` (m, 3), m/s."""
+        self.u[rows] = se3.rotate(D, self.u[rows]) + change
+        self.have_moved = self.have_moved or len(change) > 0
 
     def add_landmarks(self, points: FloatArray) -> None:
         """Append landmarks where they are seen: y_i° = Â y_i for ``points`` y_i (m, 3)."""
@@ -83,6 +85,7 @@ class Observer(FilterArrays):
 
     def add_reference_landmarks(self, y_ref: FloatArray) -> None:
         """Append landmarks with given y_i° (m, 3), metres, and â_i = 0."""
+        self.orientations.append_zeros(len(y_ref))
         rows = self.append_zeros(len(y_ref))
         self.y_ref[rows] = y_ref
 
@@ -90,10 +93,11 @@ class Observer(FilterArrays):
         """Put landmarks, at rest, where they are seen: y_i° = Â y_i with ``points`` y_i (m, 3)."""
         self.y_ref[rows] = se3.transform(self.A, points)
         self.a[rows] = self.u[rows] = 0.0
+        self.orientations.clear(rows)
 
     def fix_landmarks(self, y_ref: FloatArray) -> None:
         """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest."""
-        self.delete(np.arange(len(self)))
+        self.remove_landmarks(np.arange(len(self)))
         self.add_reference_landmarks(y_ref)
         self.have_moved = False
 
@@ -105,6 +109,7 @@ class Observer(FilterArrays):
     def remove_landmarks(self, rows: IntArray) -> None:
         """Delete the landmarks at ``rows``; those behind move up."""
         self.delete(rows)
+        self.orientations.delete(rows)
 
     def set_landmark_velocities(self, rows: IntArray, velocities: FloatArray) -> None:
         """Let landmarks move at ``velocities`` v_i (m, 3), m/s, body frame now, or rest (19)."""

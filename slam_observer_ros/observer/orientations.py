@@ -9,7 +9,6 @@ import numpy as np
 
 from slam_observer_ros.common.columns import LandmarkColumns
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry import so3
 
 UNKNOWN_RAD = 100.0
 """Standard deviation about each axis of an orientation of which nothing is known."""
@@ -78,9 +77,9 @@ class LandmarkOrientations(LandmarkColumns):
         """Let landmarks have no orientation."""
         self.B[rows] = 0.0
 
-    def turn(self, omega: FloatArray) -> None:
-        """Turn all of them, B̂_i ← exp(ω_i) B̂_i, by rotation vectors (n, 3)."""
-        self.B[...] = so3.exp(omega) @ self.B
+    def turn(self, rows: IntArray | slice, turns: FloatArray) -> None:
+        """Let those of landmarks (m,) become R_i B̂_i of ``turns`` R_i (m, 3, 3)."""
+        self.B[rows] = turns @ self.B[rows]
 
     def count(self, rows: IntArray, accepted: BoolArray) -> None:
         """Count which orientations (m,) were accepted; all others were rejected."""

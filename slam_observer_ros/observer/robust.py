@@ -39,7 +39,7 @@ def observation_weights(
     S_inv_r = _solve_residuals(r, predicted, noise)
     # The gate. No residual is further out than all of them together are.
     if np.vdot(r, S_inv_r) > gate**2:
-        passed, predicted_passed = gated(r, predicted, noise, settings)
+        passed, predicted_passed = gated(r, predicted, noise, gate)
         if not passed.all():
             weights = np.zeros(len(r))
             weights[passed] = observation_weights(
@@ -56,31 +56,31 @@ def observation_weights(
     return weights
 
 
-def are_far(sensor_distances: FloatArray, settings: Settings) -> BoolArray:
+def are_far(sensor_distances: FloatArray, gate: float) -> BoolArray:
     """Return which residuals are suspect by their distances (m,) in the sensor's noise alone."""
-    return sensor_distances > SUSPICION * settings.rejection_threshold
+    return sensor_distances > SUSPICION * gate
 
 
 def far_from_the_others(
-    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: float
 ) -> BoolArray:
     """Return which observations (m,) pass the gate, but are far off if all others are true."""
-    passed, predicted_passed = gated(r, predicted, noise, settings)
+    passed, predicted_passed = gated(r, predicted, noise, gate)
     S = with_blocks(predicted_passed, noise[passed])
     information: FloatArray = np.linalg.inv(S).astype(np.float64)
     S_inv_r = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
     blocks = diagonal_blocks(information, r.shape[1])
     # What the others leave of the residual r_i: ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i.
     left = np.asarray(np.linalg.solve(blocks, S_inv_r)[:, :, 0])
-    passed[passed] = are_far(mahalanobis(left, noise[passed]), settings)
+    passed[passed] = are_far(mahalanobis(left, noise[passed]), gate)
     return passed
 
 
 def gated(
-    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: float
 ) -> tuple[BoolArray, FloatArray]:
     """Return which observations (m,) pass the gate, and their part of ``predicted``."""
-    passed = distances(r, predicted, noise) <= settings.rejection_threshold
+    passed = distances(r, predicted, noise) <= gate
     used = np.flatnonzero(np.repeat(passed, r.shape[1]))
     return passed, predicted[used][:, used]
 

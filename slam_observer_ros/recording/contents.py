@@ -13,15 +13,10 @@ import numpy as np
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.inputs.odometry_check import OdometryCheck
 from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
-from slam_observer_ros.messages.detections import no_tags, observed_tags
-from slam_observer_ros.messages.message_types import (
-    APRILTAGS,
-    CLOUD_DECODERS,
-    ODOMETRY,
-    POSE_ARRAY,
-    TRANSFORMS,
-)
-from slam_observer_ros.messages.poses_and_velocities import decode_odometry
+from slam_observer_ros.messages.clouds import CLOUDS
+from slam_observer_ros.messages.detections import APRILTAGS, no_tags, observed_tags, POSE_ARRAY
+from slam_observer_ros.messages.poses import TRANSFORMS
+from slam_observer_ros.messages.velocities import decode_odometry, ODOMETRY
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_pose,
@@ -88,7 +83,7 @@ class Contents:
         """Return what a landmark topic's points have in place of ids; empty if they have ids."""
         if topic.message_type == POSE_ARRAY:
             return 'without ids'
-        if topic.message_type not in CLOUD_DECODERS:
+        if topic.message_type not in CLOUDS:
             return ''
         return missing_ids(self._field_names(topic), topic.message_type)
 
@@ -123,7 +118,7 @@ class Contents:
         if topic.message_type == ODOMETRY:
             decoded = self._decoded((topic,), lambda raw: decode_odometry(raw.data))
             for pose, measured in islice(decoded, MAX_COMPARED):
-                check.add(pose, measured.event)
+                check.add(pose, measured)
                 if check.is_decided:
                     break
         return check.problem
@@ -154,7 +149,7 @@ class Contents:
     def _frame(self, topic: Topic, decode: Decode) -> str:
         for measured in self._decoded((topic,), decode):
             for first in measured:
-                return first.frame_id
+                return first.sensor_frame
         return ''
 
     def _decoded(

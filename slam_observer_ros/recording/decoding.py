@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import TypeAlias
 
 import numpy as np
@@ -12,27 +12,19 @@ import numpy as np
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.inputs.event_builder import Measured
-from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.messages.detections import decode_apriltags, observed_tags
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.message_types import (
-    APRILTAGS,
-    CLOUD_DECODERS,
-    DETECTION_DECODERS,
-    POSE_DECODERS,
-    TRANSFORMS,
-    VELOCITY_DECODERS,
-)
-from slam_observer_ros.messages.point_clouds import scan_problem
-from slam_observer_ros.messages.pose_blocks import decode_poses, PoseBlock
-from slam_observer_ros.messages.poses_and_velocities import (
-    decode_imu,
-    decode_odometry_pose,
+from slam_observer_ros.messages.clouds import scan_problem
+from slam_observer_ros.messages.detections import observed_tags
+from slam_observer_ros.messages.poses import (
+    decode_poses,
     decode_transforms,
+    PoseBlock,
     PoseMessage,
+    TRANSFORMS,
 )
-from slam_observer_ros.messages.velocity_blocks import BLOCK_DECODERS, BlockDecoder
-from slam_observer_ros.recording.definitions import decoder_of_other_fields
+from slam_observer_ros.messages.registry import BlockDecoder, Decoder, decoders
+from slam_observer_ros.messages.registry import Decode as DecodeOne
+from slam_observer_ros.messages.velocities import decode_imu, decode_odometry_pose
+from slam_observer_ros.recording.definitions import landmark_decoder
 from slam_observer_ros.recording.sources import RawBlock, RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
@@ -44,45 +36,40 @@ Raises :class:`MessageError` if it is malformed, :class:`RecordingError` if it i
 """
 
 
-_OBSERVATION_DECODERS = CLOUD_DECODERS | DETECTION_DECODERS
-
-
 def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topic, Decode]:
     """Return how each of the estimator's topics is decoded."""
-    decoders: dict[Topic, Decode] = {
-        selected.velocity: _one(VELOCITY_DECODERS[selected.velocity.message_type]),
-        selected.landmarks: _landmarks,
-    }
+    velocity, landmarks = selected.velocity, selected.landmarks
+    decoded: dict[Topic, Decode] = {landmarks: _landmarks}
+    if landmarks.message_type == TRANSFORMS:
+        decoded[landmarks] = partial(_tags_on_tf, inputs.tag_frame_prefix)
+    else:
+        landmark_decoder(landmarks.message_type, landmarks.definition)  # raises, if none does
     if inputs.velocity_source == POSE_DIFFERENCES:
-        decoders[selected.velocity] = _one(decode_odometry_pose)
-    if selected.landmarks.message_type == TRANSFORMS:
-        decoders[selected.landmarks] = partial(_tags_on_tf, inputs.tag_frame_prefix)
-    elif selected.landmarks.message_type == APRILTAGS:
-        decoder_of_other_fields(APRILTAGS, selected.landmarks.definition)
-        decoders[selected.landmarks] = _one(decode_apriltags)
+        decoded[velocity] = _one(decode_odometry_pose)
+    else:
+        decoded[velocity] = _one(decoders('velocity')[velocity.message_type])
     if selected.imu is not None:
-        decoders[selected.imu] = _one(decode_imu)
-    return decoders
+        decoded[selected.imu] = _one(decode_imu)
+    return decoded
 
 
 def block_decoder(selected: SelectedTopics, inputs: InputSettings) -> BlockDecoder | None:
     """Return what decodes velocities in blocks; None if they come one by one."""
     if inputs.velocity_source == POSE_DIFFERENCES:
         return None
-    return BLOCK_DECODERS.get(selected.velocity.message_type)
+    return BlockDecoder(decoders('velocity')[selected.velocity.message_type])
 
 
-def decode_landmarks(raw: RawMessage) -> Measurement[ObservationEvent]:
+def decode_landmarks(raw: RawMessage) -> ObservationEvent:
     """Decode landmarks, measured or true."""
     topic = raw.topic
-    decode = decoder_of_other_fields(topic.message_type, topic.definition)
-    decode = decode or _OBSERVATION_DECODERS[topic.message_type]
+    decode = landmark_decoder(topic.message_type, topic.definition)
     return decode(raw.data, raw.receive_stamp_ns)
 
 
 def decode_pose(raw: RawMessage) -> PoseMessage:
     """Decode a pose; it has its receive time if its publisher left the stamp out."""
-    message = POSE_DECODERS[raw.topic.message_type](raw.data)
+    message = _pose_decoder(raw.topic.message_type)(raw.data)
     return replace(message, stamp_ns=message.stamp_ns or raw.receive_stamp_ns)
 
 
@@ -91,9 +78,15 @@ def decode_pose_block(raw: RawBlock) -> PoseBlock:
 
     Raise :class:`MessageError` if one is malformed, or they do not have all in common.
     """
-    block = decode_poses(raw.topic.message_type, raw.data)
+    decode = _pose_decoder(raw.topic.message_type)
+    block = decode_poses(decode, raw.data, raw.receive_stamps_ns)
     stamps_ns = np.where(block.stamps_ns == 0, raw.receive_stamps_ns, block.stamps_ns)
     return replace(block, stamps_ns=stamps_ns)
+
+
+@cache
+def _pose_decoder(message_type: str) -> Decoder[PoseMessage]:
+    return decoders('pose')[message_type]
 
 
 def decode_transform_message(raw: RawMessage) -> list[PoseMessage]:
@@ -101,17 +94,17 @@ def decode_transform_message(raw: RawMessage) -> list[PoseMessage]:
     return decode_transforms(raw.data)
 
 
-def _one(decode: Callable[[Buffer, int], Measured]) -> Decode:
+def _one(decode: DecodeOne[Measured]) -> Decode:
     return lambda raw: [decode(raw.data, raw.receive_stamp_ns)]
 
 
-def _landmarks(raw: RawMessage) -> list[Measurement[ObservationEvent]]:
-    message = decode_landmarks(raw)
-    problem = scan_problem(message.event)
+def _landmarks(raw: RawMessage) -> list[ObservationEvent]:
+    event = decode_landmarks(raw)
+    problem = scan_problem(event)
     if problem:
         raise RecordingError(f'{raw.topic}: {problem}')
-    return [message]
+    return [event]
 
 
-def _tags_on_tf(tag_frame_prefix: str, raw: RawMessage) -> list[Measurement[ObservationEvent]]:
+def _tags_on_tf(tag_frame_prefix: str, raw: RawMessage) -> list[ObservationEvent]:
     return observed_tags(decode_transforms(raw.data), tag_frame_prefix)

@@ -1,91 +1,66 @@
-"""How a recording defines the messages of detectors: packages change, and keep the names."""
+"""How a recording defines its messages: packages change, and keep the names; ROS 1 as ROS 2."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache, partial
-from typing import Any, TYPE_CHECKING, TypeAlias
+from functools import cache, cached_property, partial
+import re
+from typing import Any, TYPE_CHECKING
 
 from slam_observer_ros.common.errors import MessageError, RecordingError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.detections import (
     decode_detections,
-    decode_foxy_detections,
-    decode_ros1_detections,
+    DETECTIONS,
+    OTHER_DETECTIONS,
 )
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.recording.ros1 import types_in
+from slam_observer_ros.messages.registry import Decode, decoders
+from slam_observer_ros.settings.message_types import message_types
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-Decoder: TypeAlias = Callable[[Buffer, int], Measurement[ObservationEvent]]
 
-DETECTIONS = 'vision_msgs/msg/Detection3DArray'
+_IDL = re.compile(r'\s*(=+\s*IDL:|#include|module\b)')
 
-_ARUCO_MARKERS = 'std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses\n'
-_TAG_DETECTIONS = 'std_msgs/Header header\nAprilTagDetection[] detections\n'
 
-DEFINITIONS = {
-    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
-    'vision_msgs/msg/ObjectHypothesisWithPose': (
-        'ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
-    ),
-    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
-    'vision_msgs/msg/Detection3D': (
-        'std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n'
-        'string id\n'
-    ),
-    DETECTIONS: 'std_msgs/Header header\nDetection3D[] detections\n',
-    'apriltag_msgs/msg/Point': 'float64 x\nfloat64 y\n',
-    'apriltag_msgs/msg/AprilTagDetection': (
-        'string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n'
-        'Point centre\nPoint[4] corners\nfloat64[9] homography\n'
-    ),
-    'apriltag_msgs/msg/AprilTagDetectionArray': _TAG_DETECTIONS,
-    'isaac_ros_apriltag_interfaces/msg/AprilTagDetection': (
-        'string family\nint32 id\ngeometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n'
-        'geometry_msgs/PoseWithCovarianceStamped pose\n'
-    ),
-    'isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray': _TAG_DETECTIONS,
-    'aruco_opencv_msgs/msg/MarkerPose': 'uint16 marker_id\ngeometry_msgs/Pose pose\n',
-    'aruco_opencv_msgs/msg/BoardPose': 'string board_name\ngeometry_msgs/Pose pose\n',
-    'aruco_opencv_msgs/msg/ArucoDetection': (
-        'std_msgs/Header header\nMarkerPose[] markers\nBoardPose[] boards\n'
-    ),
-    'aruco_interfaces/msg/ArucoMarkers': _ARUCO_MARKERS,
-    'ros2_aruco_interfaces/msg/ArucoMarkers': _ARUCO_MARKERS,
-}
-"""What is read here of packages beyond ROS's common interfaces."""
+def types_in(definition: str, message_type: str) -> dict[str, Any]:
+    """Return what a definition defines, as rosbags has it; nothing if it can't be read."""
+    if not definition:
+        return {}
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg, TypesysError
+
+    try:
+        if _IDL.match(definition):
+            return dict(get_types_from_idl(definition))
+        return dict(get_types_from_msg(definition, message_type))
+    except (TypesysError, LookupError, ValueError):
+        return {}
 
 
 @cache
-def decoder_of_other_fields(message_type: str, definition: str) -> Decoder | None:
-    """Return what decodes a type that may have other fields than usual; None if it has not.
+def landmark_decoder(message_type: str, definition: str) -> Decode[ObservationEvent]:
+    """Return what decodes landmarks of a type, as a recording defines it.
 
-    Raises a RecordingError if nothing does.
+    Raises a RecordingError if it has other fields there than are known.
     """
-    if message_type not in DEFINITIONS:
-        return None
+    known = message_types('landmarks')[message_type]
     defined = types_in(definition, message_type)
     if message_type == DETECTIONS:
         return _decoder_of_detections(defined)
-    if message_type not in defined:
-        return None
-    known = {
-        name: what
-        for key, text in DEFINITIONS.items()
-        for name, what in types_in(text, key).items()
-    }
-    right, there = _typestore(known), _typestore(known | defined)
-    changed = [
-        name for name in defined if name in known and _layout(right, name) != _layout(there, name)
-    ]
-    if changed:
-        raise _other_release(changed)
-    return None
+    if known.definition and message_type in defined:
+        read = types_in(known.definition, message_type)
+        right, there = _typestore(read), _typestore(read | defined)
+        changed = [
+            name
+            for name in defined
+            if name in read and _layout(right, name) != _layout(there, name)
+        ]
+        if changed:
+            raise _other_release(changed)
+    return decoders('landmarks')[message_type]
 
 
 def _other_release(changed: Sequence[str]) -> RecordingError:
@@ -97,38 +72,34 @@ def _other_release(changed: Sequence[str]) -> RecordingError:
     )
 
 
-def _decoder_of_detections(defined: dict[str, Any]) -> Decoder | None:
+def _decoder_of_detections(defined: dict[str, Any]) -> Decode[ObservationEvent]:
     detection = defined.get('vision_msgs/msg/Detection3D')
     if detection is None:
         return _of_galactic_or_foxy
-    known: dict[tuple[str, ...], Decoder | None] = {
-        ('id',): None,
-        ('source_cloud', 'is_tracking', 'tracking_id'): partial(
-            _named, 'Foxy', decode_foxy_detections
-        ),
-        ('source_cloud',): partial(_named, 'ROS 1', decode_ros1_detections),
-    }
     names = tuple(name for name, _ in detection[1])
-    if names[:3] != ('header', 'results', 'bbox') or names[3:] not in known:
-        raise _other_release(['vision_msgs/msg/Detection3D'])
-    return known[names[3:]]
+    if names[:3] == ('header', 'results', 'bbox'):
+        if names[3:] == ('id',):
+            return decode_detections
+        if names[3:] in OTHER_DETECTIONS:
+            return partial(_named, *OTHER_DETECTIONS[names[3:]])
+    raise _other_release(['vision_msgs/msg/Detection3D'])
 
 
-def _of_galactic_or_foxy(raw: Buffer, receive_stamp_ns: int) -> Measurement[ObservationEvent]:
+def _of_galactic_or_foxy(raw: Buffer, receive_ns: int) -> ObservationEvent:
     """Decode detections of a recording that does not say how: Foxy's never do."""
     try:
-        return decode_detections(raw, receive_stamp_ns)
+        return decode_detections(raw, receive_ns)
     except MessageError:
         with suppress(MessageError):
-            return decode_foxy_detections(raw, receive_stamp_ns)
+            return next(iter(OTHER_DETECTIONS.values()))[1](raw, receive_ns)
         raise
 
 
 def _named(
-    release: str, decode: Decoder, raw: Buffer, receive_stamp_ns: int
-) -> Measurement[ObservationEvent]:
+    release: str, decode: Decode[ObservationEvent], raw: Buffer, receive_ns: int
+) -> ObservationEvent:
     try:
-        return decode(raw, receive_stamp_ns)
+        return decode(raw, receive_ns)
     except MessageError as error:
         raise MessageError(f'{error} (fields as in vision_msgs of {release})') from error
 
@@ -152,3 +123,23 @@ def _layout(store: Typestore, message_type: str) -> tuple[object, ...]:
         return kind.name, of(what[0]) if isinstance(what[0], tuple) else what[0], what[1]
 
     return tuple(of(described) for _, described in store.fielddefs[message_type][1])
+
+
+class Ros1Messages:
+    """Turns serialised messages of ROS 1 into CDR."""
+
+    @cached_property
+    def _typestore(self) -> Typestore:
+        from rosbags.typesys import get_typestore, Stores  # which takes a while to import
+
+        return get_typestore(Stores.ROS2_JAZZY)
+
+    def to_cdr(self, data: bytes, message_type: str, definition: str) -> memoryview:
+        """Return a message as CDR; raise RecordingError if nothing defines its type."""
+        types = self._typestore.types
+        if message_type not in types:
+            defined = types_in(definition, message_type)
+            self._typestore.register({k: v for k, v in defined.items() if k not in types})
+        if message_type not in types:
+            raise RecordingError(f'messages of type {message_type} are read of ROS 2 only')
+        return self._typestore.ros1_to_cdr(data, message_type)

@@ -10,10 +10,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
-from slam_observer_ros.common.errors import MessageError, RecordingError
+import numpy as np
+
+from slam_observer_ros.common.errors import MessageError, RecordingError, TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import Event, VelocityBlock
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import (
     drop_reason,
     DropError,
@@ -23,8 +26,8 @@ from slam_observer_ros.inputs.event_builder import (
 )
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.pose_blocks import PoseBlock
-from slam_observer_ros.messages.velocity_blocks import BlockDecoder
+from slam_observer_ros.messages.poses import PoseBlock
+from slam_observer_ros.messages.registry import BlockDecoder
 from slam_observer_ros.recording.arrivals import Arrivals
 from slam_observer_ros.recording.contents import Contents
 from slam_observer_ros.recording.decoding import (
@@ -251,6 +254,22 @@ class Recording:
         landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)
         return Truth.from_messages(poses, base_in, landmarks)
 
+    def sensor_pose(
+        self, selected: SelectedTopics, inputs: InputSettings, frame: str
+    ) -> FloatArray | None:
+        """Return the pose (4, 4) of the landmarks' sensor in the base frame; None if it moves.
+
+        ``frame`` is the sensor's, '' for the base frame itself.
+        """
+        if any(inputs.sensor_pose):
+            return se3.from_rpy(inputs.sensor_pose)
+        if frame in ('', inputs.base_frame):
+            return np.eye(4)
+        try:
+            return self._static_transforms(selected).lookup(inputs.base_frame, frame, 0)
+        except TransformError:
+            return None
+
     def _true_poses(self, topic: Topic | None) -> Iterator[PoseBlock]:
         for raw in self._source.blocks((topic,), topic) if topic else ():
             block = _pose_block(raw) if isinstance(raw, RawBlock) else None
@@ -311,11 +330,13 @@ def _velocities_of(raw: RawBlock, reading: _Reading) -> VelocityBlock | None:
     if reading.decode_block is None or len(raw.data) < FEWEST_IN_BLOCK:
         return None
     try:
-        frame_id, velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
+        velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
     except MessageError:
         return None
     has_stamps = raw.topic in reading.simulated or velocities.stamps_ns.all()
-    return velocities if has_stamps and reading.builder.passes_on(frame_id) else None
+    return (
+        velocities if has_stamps and reading.builder.passes_on(velocities.sensor_frame) else None
+    )
 
 
 def _pose_block(raw: RawBlock) -> PoseBlock | None:

@@ -16,8 +16,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import IMPOSSIBLE_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.pose_blocks import PoseBlock
+from slam_observer_ros.messages.poses import PoseBlock
 
 logger = logging.getLogger(__name__)
 
@@ -39,9 +38,7 @@ class LandmarkTracks:
     world_points: FloatArray
 
     @classmethod
-    def from_messages(
-        cls, messages: Iterable[Measurement[ObservationEvent]]
-    ) -> LandmarkTracks | None:
+    def from_messages(cls, messages: Iterable[ObservationEvent]) -> LandmarkTracks | None:
         """Gather positions of any order; None if no message has a landmark."""
         stamps_ns: list[int] = []
         states: list[_Positions] = []
@@ -97,7 +94,7 @@ class Truth:
         cls,
         poses: Sequence[PoseBlock],
         base_in: Mapping[str, FloatArray],
-        landmarks: Iterable[Measurement[ObservationEvent]],
+        landmarks: Iterable[ObservationEvent],
     ) -> Truth:
         """Gather poses and landmarks of any order; ``base_in`` is of :func:`base_in_frames`."""
         none = np.empty(0, dtype=np.int64)
@@ -116,12 +113,11 @@ class Truth:
 
 
 def _positions_by_stamp(
-    messages: Iterable[Measurement[ObservationEvent]],
+    messages: Iterable[ObservationEvent],
 ) -> Iterator[tuple[int, _Positions]]:
     """Yield what all messages of a stamp hold together, in the order of the stamps."""
     by_stamp = attrgetter('stamp_ns')
-    events = sorted((message.event for message in messages), key=by_stamp)
-    for stamp_ns, together in groupby(events, key=by_stamp):
+    for stamp_ns, together in groupby(sorted(messages, key=by_stamp), key=by_stamp):
         positions: _Positions = {}
         for event in together:
             points = map(tuple, event.points.tolist())

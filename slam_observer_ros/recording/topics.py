@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import logging
+from os.path import commonpath
 
 from slam_observer_ros.common.errors import RecordingError
-from slam_observer_ros.messages.message_types import (
-    APRILTAGS,
-    CLOUD_DECODERS,
-    DETECTION_DECODERS,
-    IMU,
-    ODOMETRY,
-    POSE_ARRAY,
-    POSE_DECODERS,
-    TRANSFORMS,
-    VELOCITY_DECODERS,
-)
+from slam_observer_ros.messages.clouds import CLOUDS
+from slam_observer_ros.messages.poses import TRANSFORMS
+from slam_observer_ros.messages.velocities import ODOMETRY
 from slam_observer_ros.recording.sources import last_part, Topic
-from slam_observer_ros.recording.transform_topics import transform_topics, TransformTopics
 from slam_observer_ros.settings.input_settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
+from slam_observer_ros.settings.message_types import message_types
 
 TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
 """Topics with one of these between the slashes of their name hold truth, not measurements."""
@@ -40,6 +33,14 @@ class TopicNames:
     pose_truth: str | None = None
     landmark_truth: str | None = None
     imu: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TransformTopics:
+    """/tf_static and /tf, or those of a namespace: each one topic, or none."""
+
+    static: tuple[Topic, ...]
+    moving: tuple[Topic, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,16 +109,15 @@ def select_topics(
     """
     used = [topic for topic in topics if topic.count > 0]
     choice = _Choice(topics, used, inputs.map_frame, has_ids, pose_frame)
-    is_of_poses = inputs.velocity_source == POSE_DIFFERENCES
-    velocity = choice.require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity)
-    landmarks = choice.require(*_landmark_choice(names.landmarks, inputs.landmarks_type))
+    velocity = choice.require(_of_velocities(inputs.velocity_source), names.velocity)
+    landmarks = choice.require(*_of_landmarks(names.landmarks, inputs.landmarks_type))
     selected = SelectedTopics(
         velocity,
         landmarks,
-        choice.pick(_POSE_TRUTH, names.pose_truth),
+        choice.pick(_of_true_poses(), names.pose_truth),
         choice.pick(_LANDMARK_TRUTH, names.landmark_truth),
         transform_topics(topics, (velocity, landmarks)),
-        choice.require(_IMU, names.imu) if inputs.use_imu else None,
+        choice.require(_of_imus(), names.imu) if inputs.use_imu else None,
     )
     if selected.pose_truth is None:
         _warn_of_unread_truth(used)
@@ -154,22 +154,62 @@ class _Choice:
             return topic.message_type in role.all_types
         if topic.message_type not in role.message_types:
             return False
-        return topic.message_type not in CLOUD_DECODERS or self.has_ids(topic)
+        return topic.message_type not in CLOUDS or self.has_ids(topic)
 
     def _is_estimate(self, topic: Topic) -> bool:
         return topic.message_type == ODOMETRY and self.pose_frame(topic) == self.map_frame
 
 
+def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> TransformTopics:
+    """Pick the /tf and the /tf_static of the robot whose measurements are replayed.
+
+    Robots in namespaces may each have their own, with the same names of frames. Those of the
+    namespace that the inputs share come first, then those further out, /tf at last. Where none
+    of these is recorded, those of another namespace are taken if there is only one.
+    """
+    trees = [
+        topic
+        for topic in topics
+        if topic.message_type == TRANSFORMS
+        and topic.count
+        and last_part(topic.name) in ('tf', 'tf_static')
+    ]
+    shared = commonpath([_namespace(topic) for topic in inputs])
+    fitting = [tree for tree in trees if _encloses(_namespace(tree), shared)]
+    if not fitting and len({_namespace(tree) for tree in trees}) == 1:
+        fitting = trees
+    if trees and not fitting:
+        logger.warning(
+            'No transforms are used: those on %s are of several robots, and none of them is in '
+            'the namespace that %s share.',
+            ', '.join(tree.name for tree in trees),
+            ' and '.join(topic.name for topic in inputs),
+        )
+    innermost_last = sorted(fitting, key=lambda tree: len(_namespace(tree)))
+    chosen = {last_part(tree.name): (tree,) for tree in innermost_last}
+    return TransformTopics(chosen.get('tf_static', ()), chosen.get('tf', ()))
+
+
+def _encloses(outer: str, inner: str) -> bool:
+    return commonpath([outer, inner]) == outer
+
+
+def _namespace(topic: Topic) -> str:
+    return '/' + topic.name.strip('/').rpartition('/')[0]
+
+
 def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:
     """Say why what looks like true poses is passed over."""
-    read = (*_POSE_TRUTH.message_types, *_LANDMARK_TRUTH.message_types)
+    poses = message_types('pose')
     unread = [
-        topic for topic in topics if _is_truth(topic.name) and topic.message_type not in read
+        topic
+        for topic in topics
+        if _is_truth(topic.name) and topic.message_type not in (*poses, *CLOUDS)
     ]
     if unread:
         logger.warning(
             'Named like ground truth, but not of a type that true poses are read of (%s): %s.',
-            _join(_POSE_TRUTH.message_types),
+            _join(poses),
             _join(unread),
         )
 
@@ -192,33 +232,37 @@ def _pose_rank(name: str) -> int:
     return 0 if last_part(name) == 'pose' else 1
 
 
-_VELOCITY = _Role('velocity', '--velocity-topic', VELOCITY_DECODERS, False, _velocity_rank)
-_ODOMETRY = _Role('odometry', '--velocity-topic', (ODOMETRY,), False, _velocity_rank)
-_IMU = _Role('Imu', '--imu', (IMU,), False, lambda _name: 0)
-_LANDMARKS = _Role(
-    'landmark',
-    '--landmarks-topic',
-    (*CLOUD_DECODERS, APRILTAGS, *(name for name in DETECTION_DECODERS if name != POSE_ARRAY)),
-    False,
-    _landmark_rank,
-    types_by_name=(POSE_ARRAY, TRANSFORMS),
-)
-_POSE_TRUTH = _Role('true pose', '--pose-truth-topic', POSE_DECODERS, True, _pose_rank)
-_LANDMARK_TRUTH = _Role(
-    'true landmark', '--landmark-truth-topic', CLOUD_DECODERS, True, _landmark_rank
-)
+def _of_velocities(source: str) -> _Role:
+    if source == POSE_DIFFERENCES:
+        return _Role('odometry', '--velocity-topic', (ODOMETRY,), False, _velocity_rank)
+    types = tuple(message_types('velocity'))
+    return _Role('velocity', '--velocity-topic', types, False, _velocity_rank)
 
 
-def _landmark_choice(name: str | None, landmarks_type: str) -> tuple[_Role, str | None]:
+def _of_landmarks(name: str | None, landmarks_type: str) -> tuple[_Role, str | None]:
     """Return which types landmarks may have, and the name of their topic if it is known."""
-    if landmarks_type == AUTO:
-        return _LANDMARKS, name
+    types = message_types('landmarks').values()
+    wanted = tuple(known.name for known in types if not known.is_ambiguous)
+    by_name = (*(known.name for known in types if known.is_ambiguous), TRANSFORMS)
     if landmarks_type == ON_TF:
-        types, name = [TRANSFORMS], name or '/tf'
-    else:
-        known = _LANDMARKS.all_types
-        types = [known_type for known_type in known if last_part(known_type) == landmarks_type]
-    return replace(_LANDMARKS, message_types=types, types_by_name=(), is_typed=True), name
+        wanted, name = (TRANSFORMS,), name or '/tf'
+    elif landmarks_type != AUTO:
+        wanted = tuple(known.name for known in types if known.short_name == landmarks_type)
+    is_typed = landmarks_type != AUTO
+    by_name = () if is_typed else by_name
+    role = _Role('landmark', '--landmarks-topic', wanted, False, _landmark_rank, by_name, is_typed)
+    return role, name
+
+
+def _of_true_poses() -> _Role:
+    return _Role('true pose', '--pose-truth-topic', tuple(message_types('pose')), True, _pose_rank)
+
+
+_LANDMARK_TRUTH = _Role('true landmark', '--landmark-truth-topic', CLOUDS, True, _landmark_rank)
+
+
+def _of_imus() -> _Role:
+    return _Role('Imu', '--imu', tuple(message_types('angular velocity')), False, lambda _name: 0)
 
 
 def _is_truth(name: str) -> bool:
@@ -254,7 +298,7 @@ def _best(fitting: Sequence[Topic], role: _Role) -> Topic | None:
 def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topic:
     if topic is not None:
         return topic
-    with_ids = '' if CLOUD_DECODERS.keys().isdisjoint(role.message_types) else ' with ids'
+    with_ids = ' with ids' if any(name in CLOUDS for name in role.message_types) else ''
     possible = [
         topic.name
         for topic in topics

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import average_nees_band, normalised_squared_errors
 from slam_observer_ros.evaluation.ellipses import CHI_SQUARE_95
-from slam_observer_ros.report.lists import Json, rounded
-from slam_observer_ros.report.reported_run import ReportedRun
+from slam_observer_ros.runs.reported_run import ReportedRun
 
 MAX_GROUPS = 150
 """Points of the curve of NIS, each the mean of as many observations as that takes."""
@@ -98,17 +99,17 @@ def _nis(run: ReportedRun) -> dict[str, Json]:
 
 def calibration(run: ReportedRun) -> list[Json]:
     """Return what was estimated of the velocity's calibration, and its standard deviation."""
-    parts = run.instants[-1].calibration if run.instants else ()
-    return [_calibration_curve(run, index) for index in range(len(parts))]
+    return [_calibration_curve(run, part.name) for part in run.calibration]
 
 
-def _calibration_curve(run: ReportedRun, index: int) -> dict[str, Json]:
-    parts = [instant.calibration[index] for instant in run.instants]
+def _calibration_curve(run: ReportedRun, name: str) -> dict[str, Json]:
+    seconds, parts = run.calibration_over_time(name)
     factor, unit = parts[-1].for_people
     return {
-        'name': parts[-1].name,
+        'name': name,
         'unit': unit,
         'nominal': factor * parts[-1].nominal,
+        't': rounded(seconds, 2),
         'value': rounded(factor * np.array([part.value for part in parts]), 5),
         'deviation': rounded(factor * np.array([part.deviation for part in parts]), 5),
     }
@@ -121,3 +122,15 @@ def drops(run: ReportedRun) -> list[Json]:
         {'reason': reason, 'count': [instant.dropped[reason] for instant in run.instants]}
         for reason in reasons
     ]
+
+
+Json: TypeAlias = Any
+"""What json.dumps takes without NaN."""
+
+
+def rounded(values: FloatArray, digits: int) -> list[Any]:
+    """Return nested lists, rounded, with None for what is not finite."""
+    numbers = np.round(np.asarray(values, dtype=np.float64), digits)
+    listed = numbers.astype(object)
+    listed[~np.isfinite(numbers)] = None
+    return list(listed.tolist())

@@ -13,12 +13,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from slam_observer_ros.common.output_files import destination, unfinished_directory
+from slam_observer_ros.common.files import destination, unfinished_directory
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import normalised_squared_errors
 from slam_observer_ros.evaluation.run_record import Instant
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.report.reported_run import ReportedRun
+from slam_observer_ros.runs.reported_run import ReportedRun
 
 TIMELINE = 'time'
 RED, GREEN, ORANGE = (213, 94, 0), (0, 158, 115), (230, 159, 0)
@@ -31,21 +31,21 @@ LEAST_HALF_M = 1e-3
 """Half-axes of an ellipsoid that is flat, which would not be seen from the side."""
 
 
-def show_in_rerun(run: ReportedRun, path: Path | None) -> None:
+def show_in_rerun(run: ReportedRun, title: str, path: Path | None) -> None:
     """Write a run to a file, whole or not at all, or open the viewer with it if that is None."""
     stream = rr.RecordingStream('slam_observer_ros')
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     if path is None:
         stream.spawn(default_blueprint=_blueprint(run))
-        _log(stream, run)
+        _log(stream, run, title)
         stream.flush()
         return
     target = destination(path)
     with unfinished_directory(target.parent) as directory:
         file = directory / target.name
         stream.save(file, default_blueprint=_blueprint(run))
-        _log(stream, run)
+        _log(stream, run, title)
         stream.disconnect()  # it writes the end of the file
         file.replace(target)
 
@@ -70,8 +70,8 @@ def _blueprint(run: ReportedRun) -> rrb.Blueprint:
     )
 
 
-def _log(stream: rr.RecordingStream, run: ReportedRun) -> None:
-    stream.send_recording_name(run.title)
+def _log(stream: rr.RecordingStream, run: ReportedRun, title: str) -> None:
+    stream.send_recording_name(title)
     stream.log('world', rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_path(stream, run)
     _log_truth(stream, run)
@@ -177,13 +177,13 @@ def _log_curves(stream: rr.RecordingStream, run: ReportedRun) -> None:
             stream, 'plots/position/aligned', run.seconds(run.errors.estimate.stamps_ns), error_m
         )
     _log_anchored(stream, run)
-    for index, part in enumerate(run.instants[-1].calibration if run.instants else ()):
+    for part in run.calibration:
         factor, unit = part.for_people
-        values = [instant.calibration[index].value for instant in run.instants]
+        seconds, parts = run.calibration_over_time(part.name)
         name = f'plots/calibration/{part.name}'
         if unit:
             stream.log(name, rr.SeriesLines(names=[f'{part.name} [{unit}]']), static=True)
-        _send(stream, name, run.instants_s, factor * np.array(values))
+        _send(stream, name, seconds, factor * np.array([each.value for each in parts]))
 
 
 def _log_anchored(stream: rr.RecordingStream, run: ReportedRun) -> None:

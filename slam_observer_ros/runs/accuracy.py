@@ -10,20 +10,20 @@ import numpy as np
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns, to_s
-from slam_observer_ros.estimates import CalibrationEstimate, Smoothed
+from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
-from slam_observer_ros.evaluation.gaps import filled
 from slam_observer_ros.evaluation.metrics import (
     landmark_errors,
     trajectory_errors,
     TrajectoryErrors,
 )
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.trajectory import filled, Trajectory
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
-from slam_observer_ros.sensor_models.calibration import DELAY, NAMES, NOMINAL
+from slam_observer_ros.sensor_models.calibration import DELAY, NAMES, stated_of_velocity
 
 logger = logging.getLogger(__name__)
 
@@ -101,23 +101,24 @@ def smoothed_trajectory(
     smoothed: Smoothed,
     stamps_ns: IntArray,
     dead_reckoning: Trajectory,
-    calibration: list[CalibrationEstimate],
+    estimator: Estimator,
 ) -> Trajectory:
     """Return the smoothed poses at any stamps (m,), such as those of the online trajectory.
 
     Between observations, and beyond the first and last one, the robot moved as the velocities
-    have it by their ``calibration``.
+    have it by the calibration of an ``estimator``.
     """
     estimate = Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
-    return filled(estimate, _calibrated(dead_reckoning, calibration), stamps_ns)
+    return filled(estimate, _calibrated(dead_reckoning, estimator), stamps_ns)
 
 
-def _calibrated(motion: Trajectory, calibration: list[CalibrationEstimate]) -> Trajectory:
+def _calibrated(motion: Trajectory, estimator: Estimator) -> Trajectory:
     """Return dead reckoning as it is with the scales, biases and the delay of the velocities."""
     if len(motion) < 2:
         return motion
-    found = {estimate.name: estimate.value for estimate in calibration}
-    values = np.array([found.get(name, value) for name, value in zip(NAMES, NOMINAL, strict=True)])
+    stated = stated_of_velocity(estimator.settings)
+    found = {estimate.name: estimate.value for estimate in estimator.calibration}
+    values = np.array([found.get(name, value) for name, value in zip(NAMES, stated, strict=True)])
     dt_s = to_s(np.diff(motion.stamps_ns))[:, None]
     twists = se3.log(se3.inverse(motion.poses[:-1]) @ motion.poses[1:])
     moves = np.abs(twists).max(axis=1, keepdims=True) > STILL

@@ -1,22 +1,91 @@
-"""What diagnostics say of an estimator, live and in the recording of a replay."""
+"""The judge of health: what is wrong with an estimate, live and in a replay alike.
+
+What it finds are data (``common/findings.py``), which table, JSON, report, log and /diagnostics
+show. ``input_health.py`` judges what a recording holds, ``error_health.py`` its errors.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+import math
 from typing import Any, Protocol
 
+from slam_observer_ros.common.findings import Finding, found, Level
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.estimates import (
-    calibration_problems,
     CalibrationEstimate,
+    DELAY_NAME,
     MotionFactor,
+    point_share,
+    RangePower,
+    UNUSED_POINTS,
     Update,
 )
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
-OK, WARN = 0, 1
-"""Levels of diagnostic_msgs/DiagnosticStatus."""
+MAX_REJECTED = 0.1
+"""Share of the points beyond which they are more than a sensor's outliers."""
+
+MAX_REJECTED_ORIENTATIONS = 0.5
+"""Share of the points beyond which they are more than the flips of small or frontal tags."""
+
+MAX_UNMAPPED = 0.5
+"""Share of the points beyond which they are more than what a map has not got yet."""
+
+LEFT_OUT = (
+    'rejected_landmark',
+    'unknown_id',
+    'repeated_id',
+    'reserved_id',
+    'impossible_id',
+    'unweighed_point',
+)
+"""Points not used for something that is wrong; those that are not in a known map may be right."""
+
+WRONG_IDS = ('repeated_id', 'reserved_id', 'impossible_id')
+"""Of those, what a sensor should never give: one is enough to say so."""
+
+NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
+"""Least delay of velocities that is worth a finding, and by how many of its deviations."""
+
+SHOWN, SURE = 0.25, 4.0
+"""Power of the cosine in ranges, over that of what they are taken for, that is worth a finding,
+and by how many of its deviations."""
+
+IMPLAUSIBLE = 4.0
+"""Stated standard deviations by which no calibration is off: something else is wrong."""
+
+NOTABLY_NOISIER = 1.5
+"""Factor of the noise of the odometry from which it is named as a problem."""
+
+NOTABLY_WRONG, TOO_WRONG = math.sqrt(1.5), 2.0
+"""Factors of the stated noise that are worth a note, and those that neither chance nor a sensor's
+usual correlation explains."""
+
+NOISELESS = 0.01
+"""Share of the stated noise below which there is none at all."""
+
+MOUNTED = {
+    'sensor_rotation': (
+        (
+            'further rolled to the right/further rolled to the left',
+            'further down/further up',
+            'further to the left/further to the right',
+        ),
+        ('roll', 'pitch', 'yaw'),
+    ),
+    'sensor_translation': (
+        (
+            'further forward/further back',
+            'further to the left/further to the right',
+            'higher/lower',
+        ),
+        ('x', 'y', 'z'),
+    ),
+}
+"""In words, by axis, how a sensor is mounted whose turn or shift is positive/negative."""
 
 
 class Diagnosed(Protocol):
@@ -42,8 +111,10 @@ class Diagnosed(Protocol):
     def velocity_is_stale(self) -> bool: ...  # noqa: D102
 
 
-def estimator_values(estimator: Diagnosed, dropped: Counter[str]) -> dict[str, str]:
-    """Return what was used, what was dropped and why, the map's size, calibration and noise."""
+def estimator_values(
+    estimator: Diagnosed, dropped: Counter[str], findings: Iterable[Finding]
+) -> dict[str, str]:
+    """Return what was used and dropped and why, map, calibration and noise, and what to do."""
     update = estimator.last_update
     values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
     values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
@@ -51,29 +122,173 @@ def estimator_values(estimator: Diagnosed, dropped: Counter[str]) -> dict[str, s
     values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
     values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
     values |= {f'noise of {part.name}': str(part) for part in estimator.motion_factors}
-    advice = {part.name: part.advice for part in estimator.calibration if part.advice}
-    values |= {f'mounting: {name}': text for name, text in advice.items()}
+    values |= {f'to do: {each.what}': each.remedy for each in findings}
     values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
     return values
 
 
-def estimator_warnings(estimator: Diagnosed) -> list[str]:
-    """Return what is wrong with the velocity or its noise, by the estimate alone."""
+def of_estimate(estimator: Diagnosed) -> list[Finding]:
+    """Judge the velocity, its calibration and its noise, by the estimate alone."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
-    warnings = ['no velocity in force: the pose is held'] if stale else []
-    warnings += calibration_problems(estimator.calibration)
-    return warnings + [part.problem for part in estimator.motion_factors if part.problem]
+    return [
+        *([found('stale_velocity')] if stale else []),
+        *of_calibration(estimator.calibration),
+        *of_mounting(estimator.calibration),
+        *of_noise(estimator.motion_factors),
+    ]
+
+
+def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
+    """Judge what was found out of the velocity: a delay first, as scales make up for it."""
+    parts = list(calibration)
+    for part in parts:
+        notable_s = max(NOTABLE_DELAY_S, CERTAIN * part.deviation)
+        if part.name == DELAY_NAME and abs(part.value - part.nominal) > notable_s:
+            when = 'late' if part.value > 0.0 else 'early'
+            return [found('late_odometry', delay_s=abs(part.value), when=when, set_to=part.value)]
+    return [_implausible(part) for part in parts if _times_off(part) > IMPLAUSIBLE]
+
+
+def _times_off(part: CalibrationEstimate) -> float:
+    return abs(part.value - part.nominal) / part.stated
+
+
+def _implausible(part: CalibrationEstimate) -> Finding:
+    factor, unit = part.for_people
+    return found(
+        'implausible_calibration',
+        name=part.name,
+        value=factor * part.value,
+        times=_times_off(part),
+        stated=factor * part.stated,
+        nominal=f'{factor * part.nominal:g} {unit}'.rstrip(),
+    )
+
+
+def of_mounting(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
+    """Say what to set so that sensors are stated as they were found to be."""
+    return [finding for part in calibration if (finding := _mounting(part))]
+
+
+def _mounting(part: CalibrationEstimate) -> Finding | None:
+    """Judge one property of a sensor.
+
+    It is found where it is three standard deviations off, and those have become a third.
+    """
+    name, _, frame = part.name.partition('/')
+    off, sensor = part.value - part.nominal, frame or 'the sensor'
+    if abs(off) < 3.0 * part.deviation or 3.0 * part.deviation > part.stated:
+        return None
+    if name == 'range_scale':
+        return found('range_scale', sensor=sensor, found=part, value=part.value)
+    mounted, _, axis = name.rpartition('_')
+    if mounted not in MOUNTED:
+        return None
+    factor, unit = part.for_people
+    words, entries = MOUNTED[mounted]
+    number = 'xyz'.index(axis)
+    return found(
+        'mounting',
+        sensor=sensor,
+        off=f'{abs(factor * off):.2g} ± {factor * part.deviation:.2g} {unit}',
+        towards=words[number].split('/')[int(off < 0.0)],
+        amount=off,
+        entry=entries[number],
+    )
+
+
+def of_ranges(power: RangePower | None, is_depth: bool) -> list[Finding]:
+    """Judge whether ranges are what they are taken for, ranges or depths along the axis.
+
+    What is estimated follows what they are taken for, so that only a part of the power is seen.
+    """
+    if power is None:
+        return []
+    # How far towards the other of the two.
+    off = 1.0 - power.value if is_depth else power.value
+    if off < max(SHOWN, SURE * power.deviation):
+        return []
+    looks, set_to = ('range, not depth', 'false') if is_depth else ('depth along the axis', 'true')
+    return [
+        found(
+            'depth_for_range',
+            looks=looks,
+            power=power.value,
+            deviation=power.deviation,
+            set_to=set_to,
+        )
+    ]
+
+
+def of_noise(factors: Iterable[MotionFactor]) -> list[Finding]:
+    """Judge how noisy the odometry is: say what to state if it clearly is more than stated."""
+    return [
+        found(
+            'noisy_odometry',
+            factor=part.factor,
+            motion=part.name,
+            proposed=f'set {part.proposed}' if part.proposed else 'state more',
+        )
+        for part in factors
+        if part.factor >= NOTABLY_NOISIER and math.log(part.factor) > IMPLAUSIBLE * part.deviation
+    ]
+
+
+def of_fit(factor: float | None) -> list[Finding]:
+    """Judge how many times as large as stated innovations are; None if that is not known.
+
+    Next to nothing is that of sensors without any noise, as a simulation's may be.
+    """
+    if factor is None or factor < NOISELESS:
+        return []
+    if factor > NOTABLY_WRONG:
+        level = Level.WARNING if factor > TOO_WRONG else Level.NOTE
+        return [replace(found('small_noise', factor=factor), level=level)]
+    return [found('large_noise', factor=1.0 / factor)] if factor < 1.0 / TOO_WRONG else []
+
+
+def of_rejections(counts: Counter[str], when: str = '') -> list[Finding]:
+    """Judge whether more points or orientations were rejected than are outliers."""
+    points, orientations = (
+        point_share(counts, f'rejected_{what}') for what in ('landmark', 'orientation')
+    )
+    found_so = []
+    if points > MAX_REJECTED:
+        found_so.append(found('rejected_points', percent=100.0 * points, when=when))
+    if orientations > MAX_REJECTED_ORIENTATIONS:
+        found_so.append(found('rejected_orientations', percent=100.0 * orientations, when=when))
+    return found_so
+
+
+def of_left_out(counts: Counter[str], level: Level) -> list[Finding]:
+    """Report points that were left out: most of them, or for their ids."""
+    left_out = {name: counts[name] for name in LEFT_OUT if counts[name]}
+    of_wrong_ids = any(counts[name] for name in WRONG_IDS)
+    if not (of_wrong_ids or 2 * sum(left_out.values()) > counts['observed_point']):
+        return []
+    reasons = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())
+    finding = found('left_out_points', count=counts['observed_point'], reasons=reasons)
+    return [replace(finding, level=level)]
+
+
+def of_map(counts: Counter[str], *, is_start_given: bool) -> Iterator[Finding]:
+    """Judge whether a map that does not grow is that of the place."""
+    share = point_share(counts, 'unmapped_landmark')
+    if share > MAX_UNMAPPED:
+        start = ', and did the robot start where it was said to' if is_start_given else ''
+        yield found('unmapped_points', percent=100.0 * share, start=start)
 
 
 def diagnostics(
     messages: OutgoingMessages, stamp_ns: int, estimator: Diagnosed, hardware_id: str
 ) -> Any:
     """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
-    warnings = estimator_warnings(estimator)
-    values = estimator_values(estimator, estimator.dropped)
+    findings = of_estimate(estimator)
+    warnings = [finding.what for finding in findings]
+    values = estimator_values(estimator, estimator.dropped, findings)
     status = messages.make(
         'diagnostic_msgs/msg/DiagnosticStatus',
-        level=WARN if warnings else OK,
+        level=Level.WARNING if warnings else Level.NOTE,
         name='observer_node: estimate',
         message='; '.join(warnings) or 'running',
         hardware_id=hardware_id,

@@ -32,9 +32,6 @@ NAMES = (
 
 DELAY = NAMES.index(DELAY_NAME)
 
-NOMINAL = np.repeat([1.0, 0.0], [6, 7])
-"""(13,) what they are where the velocity is right; scales as factors 1 + s."""
-
 MIN_DELAY_S = -0.2
 """Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier.
 How the robot moves so much later is not known yet when it is needed: without a limit the
@@ -63,9 +60,10 @@ class Calibration:
         self._estimated: IntArray = possible[errors[possible] > 0.0]
         self._scales = int(np.sum(self._estimated < 6))
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
-        self._all: FloatArray = NOMINAL.copy()
+        self._nominal = stated_of_velocity(settings)
+        self._all: FloatArray = self._nominal.copy()
         # τ; where it is negative the latest velocity is held for longer.
-        self.delay_ns = 0
+        self.delay_ns = to_ns(settings.velocity_delay)
         self.sensors: dict[str, SensorCalibration] = {}
         stated, deviations = _of_a_sensor(settings)
         of_sensor = np.append(pose, SCALE)
@@ -137,7 +135,7 @@ class Calibration:
                 float(self._all[i]),
                 float(np.sqrt(variance)),
                 UNITS[i],
-                nominal=float(NOMINAL[i]),
+                nominal=float(self._nominal[i]),
                 stated=float(error),
             )
             for i, variance, error in zip(self._estimated, variances, stated, strict=False)
@@ -239,8 +237,22 @@ class Calibration:
         self._all[self._estimated] += change[: self.of_velocity]
         for sensor in self.sensors.values():
             sensor.shift(change[self.columns(sensor)])
-        self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)
+        least_s = min(MIN_DELAY_S, self._nominal[DELAY])
+        self._all[DELAY] = min(max(self._all[DELAY], least_s), MAX_DELAY_S)
         self.delay_ns = to_ns(float(self._all[DELAY]))
+
+
+def stated_of_velocity(settings: Settings) -> FloatArray:
+    """Return what the settings state of the velocity (13,): factors 1 + s, biases b and τ."""
+    return np.array(
+        [
+            *settings.angular_scale,
+            *settings.linear_scale,
+            *settings.angular_bias,
+            *settings.linear_bias,
+            settings.velocity_delay,
+        ]
+    )
 
 
 def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:

@@ -21,9 +21,9 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 
 _PER_MEDIAN = 1.4826
@@ -42,17 +42,28 @@ class DelayEvidence:
         # (6,) mean of how velocities usually differ from the one before, of how many motions.
         self._steps, self._used, self._seen = np.zeros(6), 0, 0
 
-    def add(self, velocities: VelocityHistory, motion: Motion, start_ns: int, end_ns: int) -> None:
-        """Take in a motion between two stamps, of a state that estimates the delay."""
+    def add(
+        self,
+        velocities: VelocityHistory,
+        calibration: Calibration,
+        variances: FloatArray,
+        start_ns: int,
+        end_ns: int,
+    ) -> None:
+        """Take in a motion between two stamps, of a state that estimates the delay.
+
+        It was off by ``variances`` (6,) by axis, rad² and m².
+        """
         self._seen += 1
         if self._seen % SAMPLED:
             return
-        delay_ns, reach_ns = motion.calibration.delay_ns, motion.calibration.delay_error_ns
+        delay_ns, reach_ns = calibration.delay_ns, calibration.delay_error_ns
+        duration_s = to_s(end_ns - start_ns)
         centres_ns = start_ns - delay_ns, end_ns - delay_ns
         stamps, V = velocities.between(centres_ns[0] - reach_ns, end_ns)
-        if len(stamps) < 3 or stamps[0] == stamps[-1] or motion.duration_s <= 0.0:
+        if len(stamps) < 3 or stamps[0] == stamps[-1] or duration_s <= 0.0:
             return
-        axes = motion.calibration.axes.pose
+        axes = calibration.axes.pose
         V = V[:, axes]
         W = _weights(stamps, centres_ns[1], reach_ns, end_ns)
         W -= _weights(stamps, centres_ns[0], reach_ns, start_ns)
@@ -63,13 +74,13 @@ class DelayEvidence:
         self._used += 1
         self._steps[axes] += (steps - self._steps[axes]) / self._used
         found = 0.5 * (_PER_MEDIAN * self._steps[axes]) ** 2 * period_s
-        stated = np.diagonal(motion.covariances.sum(axis=0))[axes] / motion.duration_s
+        stated = variances[axes] / duration_s
         is_noisy = stated > 0.0
         stated = stated[is_noisy]
         share = float(np.minimum(found[is_noisy] / stated, 1.0).sum()) / period_s
-        self._information += float((W.dot(V)[is_noisy] ** 2 / stated).sum()) / motion.duration_s
-        self._noise += share * float(W.dot(W)) / motion.duration_s
-        self._pull += share * float(W.dot(in_force_s)) / motion.duration_s
+        self._information += float((W.dot(V)[is_noisy] ** 2 / stated).sum()) / duration_s
+        self._noise += share * float(W.dot(W)) / duration_s
+        self._pull += share * float(W.dot(in_force_s)) / duration_s
 
     def corrected(self, delay: CalibrationEstimate, initial_s: float) -> CalibrationEstimate:
         """Return the estimate, ± ``initial_s`` at the start, without what the noise adds to it."""

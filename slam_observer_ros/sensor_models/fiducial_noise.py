@@ -25,13 +25,6 @@ LEAST_NOISE = 1e-6
 """Noise of corners, in focal lengths, beside which less is lost in rounding."""
 
 
-def along_and_across(range_squared: FloatArray, s: Settings) -> tuple[FloatArray, FloatArray]:
-    """Return the variances (m,) of a tag's position along and across the line of sight, m²."""
-    per_focal_length = (s.pixel_noise / s.focal_length) ** 2
-    along = 0.5 * per_focal_length * (range_squared / s.tag_size) ** 2
-    return along, 0.25 * per_focal_length * range_squared
-
-
 def orientation_covariances(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatArray:
     """Return the covariances (m, 3, 3) of tags' orientations, rad², of tags turned by ``Z``.
 

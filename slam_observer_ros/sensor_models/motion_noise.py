@@ -23,6 +23,7 @@ from __future__ import annotations
 from copy import copy
 from functools import lru_cache
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,6 +75,24 @@ KINDS = {'turning': 'angular', 'driving': 'linear'}
 _IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
 
 
+class MotionFigures(NamedTuple):
+    """How far velocities may be off."""
+
+    densities: FloatArray  # (6,) variances of the motion per second, rad² and m²
+    scales: FloatArray  # (6,) the same in proportion to the mean velocity, its square root
+    factors: FloatArray  # (2,) of both, for turning and driving
+
+
+class Factors(NamedTuple):
+    """From what the factors of the noise of the motion are found, changed in place."""
+
+    shares: FloatArray  # (2, p, p) N_j of the motion since the last observation
+    logs: FloatArray  # (2,) θ
+    information: FloatArray  # (2, 2) F̄
+    applied: FloatArray  # (2,)
+    least: float  # least θ that is applied
+
+
 class MotionNoise:
     """How far motions may be off: noise densities of the settings, or covariances of messages.
 
@@ -121,6 +140,13 @@ class MotionNoise:
             stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
+
+    @property
+    def figures(self) -> MotionFigures:
+        """How far velocities without a stated covariance may be off now."""
+        s = self._settings
+        densities = _squares(s.angular_velocity_noise, s.linear_velocity_noise)
+        return MotionFigures(densities, self._scale, self.factors.applied)
 
     def is_summed(self, held: HeldVelocities) -> bool:
         """Return whether what one motion may be off by does not depend on others."""
@@ -205,14 +231,32 @@ class MotionFactors:
         C = C.reshape(-1, C.shape[2])
         if np.count_nonzero(ratios != 1.0):
             S = S + C.dot((N - shares).sum(axis=0)).dot(C.T)
-        g, F = self._score(r, S, C, N)
-        self._information = (1.0 - 1.0 / MEMORY) * self._information + F
-        change = np.linalg.solve(self._information + _PRIOR, g - self._logs / MEMORY)
-        logs = self._logs + np.minimum(np.maximum(change, -MAX_STEP), MAX_STEP)
-        self._logs = np.minimum(np.maximum(logs, LEAST_LOGARITHM), LARGEST_LOGARITHM)
+        self._information, self._logs = learnt(
+            self._logs, self._information, *self._score(r, S, C, N)
+        )
         if self._least < math.inf:
             self.applied = np.exp(np.maximum(self._logs, self._least))
         self._found += 1
+
+    def flat(self) -> Factors | None:
+        """Return what there is to learn from as plain arrays; None if there is nothing."""
+        if self._shares is None or not self._shares.ndim:
+            return None
+        return Factors(
+            self._shares,
+            self._logs.copy(),
+            self._information.copy(),
+            self.applied.copy(),
+            self._least,
+        )
+
+    def take(self, factors: Factors | None) -> None:
+        """Take over what was learnt with these of :meth:`flat`."""
+        self.forget_motion()
+        if factors is not None:
+            self._logs, self._information = factors.logs, factors.information
+            self.applied = factors.applied
+            self._found += 1
 
     def forget_motion(self) -> None:
         """Let the motion until now be of no concern for what is seen next."""
@@ -233,11 +277,7 @@ class MotionFactors:
             if len(r) < 2 * np.count_nonzero(passed) < 2 * len(r):
                 used = np.flatnonzero(np.repeat(passed, k))
                 return self._score(r[passed], S[np.ix_(used, used)], C[used], N)
-        u, G = C.T.dot(S_inv_r)[:, 0], C.T.dot(S_inv_C)
-        w, NG = min(1.0, _rare(r.size) / max(squared, 1.0)), N.dot(G)
-        g = 0.5 * (w * N.dot(u).dot(u) - N.reshape(2, -1).dot(G.ravel()))
-        F = 0.5 * NG.reshape(2, -1).dot(NG.swapaxes(1, 2).reshape(2, -1).T)
-        return g, F
+        return score(C.T.dot(S_inv_r)[:, 0], C.T.dot(S_inv_C), N, squared, r.size)
 
     def _proposed(self, name: str) -> str:
         """Return the settings that state what was found."""
@@ -250,6 +290,26 @@ class MotionFactors:
             for each, values in stated.items()
             if any(values)
         )
+
+
+def score(
+    u: FloatArray, G: FloatArray, N: FloatArray, squared: float, q: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return g (2,) and F (2, 2), of q residuals at the squared distance rᵀ S⁻¹ r."""
+    w, NG = min(1.0, _rare(q) / max(squared, 1.0)), N.dot(G)
+    g = 0.5 * (w * N.dot(u).dot(u) - N.reshape(2, -1).dot(G.ravel()))
+    F = 0.5 * NG.reshape(2, -1).dot(NG.swapaxes(1, 2).reshape(2, -1).T)
+    return g, F
+
+
+def learnt(
+    logs: FloatArray, information: FloatArray, g: FloatArray, F: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return F̄ (2, 2) and θ (2,) after an observation of g and F."""
+    information = (1.0 - 1.0 / MEMORY) * information + F
+    change = np.linalg.solve(information + _PRIOR, g - logs / MEMORY)
+    logs = logs + np.minimum(np.maximum(change, -MAX_STEP), MAX_STEP)
+    return information, np.minimum(np.maximum(logs, LEAST_LOGARITHM), LARGEST_LOGARITHM)
 
 
 def _rare(q: int) -> float:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.matrices import limited
-from slam_observer_ros.sensor_models.fiducial_noise import (
-    along_and_across,
-    orientation_covariances,
-)
+from slam_observer_ros.sensor_models.fiducial_noise import orientation_covariances
 from slam_observer_ros.settings.estimator_settings import Settings
 
 RESOLUTION_M = 1e-4
@@ -38,6 +37,16 @@ _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 
 
+class PointFigures(NamedTuple):
+    """How far points may be off: variances along and across the line of sight of length r, m²."""
+
+    along_0: float
+    along_2: float  # times r²
+    along_4: float  # times r⁴
+    across_0: float
+    across_2: float  # times r²
+
+
 class ObservationNoise:
     """How far observed points may be off, as ``observation_model`` and its figures say.
 
@@ -60,15 +69,7 @@ class ObservationNoise:
         lines_of_sight = event.lines_of_sight if lines_of_sight is None else lines_of_sight
         if event.covariances is None:
             return self.at(lines_of_sight)
-        # Else far points that are said to be exact are lost beside an uncertain heading.
-        squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
-        least = RELATIVE_RESOLUTION**2 * squared_m2
-        stated = limited(event.covariances, np.full(3, MAX_ERROR_M))
-        covariances = _invertible(stated + least[:, None, None] * _IDENTITY)
-        unknown = ~event.covariances.any(axis=(1, 2))
-        if unknown.any():
-            covariances[unknown] = self.at(lines_of_sight[unknown])
-        return covariances
+        return stated_covariances(event.points, event.covariances, lines_of_sight, self.figures)
 
     def orientation_covariances(self, event: ObservationEvent, Z: FloatArray) -> FloatArray:
         """Return what an observation's orientations may be off by (m, 3, 3), rad².
@@ -88,21 +89,38 @@ class ObservationNoise:
 
     def at(self, lines_of_sight: FloatArray) -> FloatArray:
         """Return what the settings say of points along ``lines_of_sight`` (m, 3)."""
+        return point_covariances(lines_of_sight, self.figures)
+
+    @property
+    def figures(self) -> PointFigures:
+        """How far points may be off, as the settings say now."""
         s = self._settings
         if s.observation_model == 'cartesian':
-            each = np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(lines_of_sight), 3, 3))
-            return _invertible(each)
-        range_squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)
+            return PointFigures(s.point_noise**2, 0.0, 0.0, s.point_noise**2, 0.0)
+        if s.observation_model == 'range_bearing':
+            return PointFigures(
+                s.range_noise**2, s.range_scale_noise**2, 0.0, 0.0, s.bearing_noise**2
+            )
+        squared = (s.pixel_noise / s.focal_length) ** 2
         if s.observation_model == 'stereo':
             parallax = s.disparity_noise / (s.focal_length * s.stereo_baseline)
-            along = (range_squared * parallax) ** 2
-            across = range_squared * (s.pixel_noise / s.focal_length) ** 2
-        elif s.observation_model == 'fiducial':
-            along, across = along_and_across(range_squared, s)
-        else:
-            along = s.range_noise**2 + range_squared * s.range_scale_noise**2
-            across = range_squared * s.bearing_noise**2
-        return _along_and_across(lines_of_sight, range_squared, along, across)
+            return PointFigures(0.0, 0.0, parallax**2, 0.0, squared)
+        # The mean of a tag's four corners, and their spread (:mod:`.fiducial_noise`).
+        return PointFigures(0.0, 0.0, 0.5 * squared / s.tag_size**2, 0.0, 0.25 * squared)
+
+
+def stated_covariances(
+    points: FloatArray, stated: FloatArray, lines_of_sight: FloatArray, figures: PointFigures
+) -> FloatArray:
+    """Return covariances (m, 3, 3) of ``points`` as stated, or by the figures where unknown."""
+    # Else far points that are said to be exact are lost beside an uncertain heading.
+    least = RELATIVE_RESOLUTION**2 * np.einsum('ij,ij->i', points, points)
+    covariances = limited(stated, np.full(3, MAX_ERROR_M)) + least[:, None, None] * _IDENTITY
+    covariances = _invertible(covariances)
+    unknown = ~stated.any(axis=(1, 2))
+    if unknown.any():
+        covariances[unknown] = point_covariances(lines_of_sight[unknown], figures)
+    return covariances
 
 
 def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
@@ -127,16 +145,17 @@ def _invertible(covariances: FloatArray) -> FloatArray:
     return invertible
 
 
-def _along_and_across(
-    lines_of_sight: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
-) -> FloatArray:
-    """Return covariances with given variances along and across the line of sight, invertible.
+def point_covariances(lines_of_sight: FloatArray, figures: PointFigures) -> FloatArray:
+    """Return covariances (m, 3, 3) of points along ``lines_of_sight`` (m, 3), invertible.
 
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """
-    if np.count_nonzero(range_squared) < len(range_squared):
-        across = np.where(range_squared > 0.0, across, along)
-    excess = (along - across) / np.maximum(range_squared, _TINY)
+    squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)
+    along = figures.along_0 + (figures.along_2 + figures.along_4 * squared) * squared
+    across = figures.across_0 + figures.across_2 * squared
+    if np.count_nonzero(squared) < len(squared):
+        across = np.where(squared > 0.0, across, along)
+    excess = (along - across) / np.maximum(squared, _TINY)
     scaled = excess[:, None] * lines_of_sight
     covariances: FloatArray = scaled[:, :, None] * lines_of_sight[:, None, :]
     # As of _invertible, but with the trace that is known.

@@ -33,7 +33,7 @@ def corrected(
     origins = np.zeros_like(event.points) if event.sensor is None else event.sensor
     arms = event.points - origins
     if settings.range_is_depth:
-        arms = arms / _cosines(arms, event.sensor_axis)[:, None]
+        arms = arms / cosines(arms, event.sensor_axis)[:, None]
     sensed = Sensed(np.full(len(arms), sensor.number), origins, arms, event.orientations)
     covariances, velocities, R = event.covariances, event.velocities, so3.exp(sensor.values[:3])
     if covariances is not None:
@@ -87,7 +87,7 @@ def turn_sensitivity(calibration: Calibration, event: ObservationEvent) -> Float
     return D
 
 
-def _cosines(arms: FloatArray, axis: FloatArray | None) -> FloatArray:
+def cosines(arms: FloatArray, axis: FloatArray | None) -> FloatArray:
     """Return cos b (m,) of lines of sight (m, 3) off the sensor's axis (3,), x by default."""
     lengths = np.sqrt(np.einsum('ij,ij->i', arms, arms))
     along = arms.dot(_ALONG_X if axis is None else axis)

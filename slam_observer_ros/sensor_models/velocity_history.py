@@ -33,6 +33,20 @@ FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
 
 
+class Velocities(NamedTuple):
+    """Velocities of one or two sensors, each in force from its stamp to the next.
+
+    Columns of two are of the angular and the linear part.
+    """
+
+    stamps_ns: IntArray  # (r,)
+    body_velocities: FloatArray  # (r, 6)
+    since_ns: IntArray  # (r, 2) stamps of the messages that they are of
+    is_stated: BoolArray  # (r, 2) whether a message stated its covariance
+    usual_s: tuple[float, float]  # how long one is held as a rule
+    timeout_ns: int  # how long one is held at most
+
+
 class VelocityHistory:
     """Velocity events in stamp order, joined with the angular velocities of another sensor.
 
@@ -184,6 +198,18 @@ class VelocityHistory:
         stamps = np.array(self._stamps_ns[first:last], dtype=np.int64)
         return stamps, first, stamps.searchsorted(stamps_ns, 'right') - 1
 
+    def flat(self) -> Velocities:
+        """Return all that are known as plain arrays."""
+        count, joined = len(self._stamps_ns), self._written()
+        return Velocities(
+            joined.stamps_ns[:count],
+            joined.body_velocities,
+            joined.since_ns,
+            joined.is_stated,
+            self._usual_s(),
+            self._timeout_ns,
+        )
+
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
         pieces = self._pieces(start_ns, end_ns)
@@ -244,7 +270,8 @@ class VelocityHistory:
         if count > self._joined.capacity:
             self._joined = self._joined.copied(slice(None), 2 * count)
         if self._unwritten:
-            self._joined.write(count - len(self._unwritten), self._unwritten)
+            first = count - len(self._unwritten)
+            self._joined.write(first, self._stamps_ns[first:], self._unwritten)
             self._unwritten = []
         return self._joined
 
@@ -311,6 +338,7 @@ class _Joined:
     Columns of two: angular and linear part, with the stamp of the message that each is of.
     """
 
+    stamps_ns: IntArray  # (c,) from when on each is in force
     body_velocities: FloatArray  # (c, 6)
     covariances: FloatArray  # (c, 6, 6), zero where unknown
     is_stated: BoolArray  # (c, 2)
@@ -321,6 +349,7 @@ class _Joined:
     def with_room_for(cls, capacity: int) -> _Joined:
         """Return unknown velocities."""
         return cls(
+            np.full(capacity, NEVER_NS, dtype=np.int64),
             np.zeros((capacity, 6)),
             np.zeros((capacity, 6, 6)),
             np.zeros((capacity, 2), dtype=np.bool_),
@@ -347,6 +376,7 @@ class _Joined:
         """As :meth:`write`, of velocities of one sensor."""
         rows, covariances = slice(first, first + len(velocities)), velocities.covariances
         self.body_velocities[rows] = velocities.body_velocities
+        self.stamps_ns[rows] = velocities.stamps_ns
         self.since_ns[rows] = velocities.stamps_ns[:, None]
         self.usual_s[rows] = np.array(usual_s)[:, None]
         if covariances is not None:
@@ -354,11 +384,12 @@ class _Joined:
             self.is_stated[rows, 0] = covariances[:, :3, :3].any(axis=(1, 2))
             self.is_stated[rows, 1] = covariances[:, 3:, 3:].any(axis=(1, 2))
 
-    def write(self, first: int, events: list[_InForce]) -> None:
+    def write(self, first: int, in_force_ns: list[int], events: list[_InForce]) -> None:
         """Fill in rows from ``first`` on, once: others may see them."""
         rows = slice(first, first + len(events))
         self.body_velocities[rows] = [velocity.body_velocity for velocity, *_ in events]
         stamps_ns = np.array([velocity.stamp_ns for velocity, *_ in events], dtype=np.int64)
+        self.stamps_ns[rows] = in_force_ns
         self.since_ns[rows] = stamps_ns[:, None]
         self.usual_s[rows] = [usual_s for *_, usual_s in events]
         for row, (velocity, angular, _) in enumerate(events, first):

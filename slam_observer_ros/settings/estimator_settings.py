@@ -262,6 +262,42 @@ class Settings:
         minimum=0.0,
         maximum=60.0,
     )
+    angular_scale: Vector3 = parameter(
+        (1.0, 1.0, 1.0),
+        'What the angular velocity x y z is multiplied by, as for a track that is wider than the '
+        'driver knows',
+        minimum=0.1,
+        maximum=10.0,
+    )
+    linear_scale: Vector3 = parameter(
+        (1.0, 1.0, 1.0),
+        'What the linear velocity x y z is multiplied by, as for wheels that are larger than the '
+        'driver knows',
+        minimum=0.1,
+        maximum=10.0,
+    )
+    angular_bias: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'What is added to the angular velocity x y z after that, unless all of it is zero',
+        unit='rad/s',
+        minimum=-10.0,
+        maximum=10.0,
+    )
+    linear_bias: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'What is added to the linear velocity x y z after that, unless all of it is zero',
+        unit='m/s',
+        minimum=-100.0,
+        maximum=100.0,
+    )
+    velocity_delay: float = parameter(
+        0.0,
+        'How much later than its stamp a velocity shows in observations; below zero where it is '
+        'stamped late',
+        unit='s',
+        minimum=-MAX_DELAY_S,
+        maximum=MAX_DELAY_S,
+    )
     angular_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Scheduled and Riccati gains: scale error of the angular velocity x y z to be estimated: '

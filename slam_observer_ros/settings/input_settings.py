@@ -7,6 +7,7 @@ from itertools import combinations
 from typing import TypeVar
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.settings.message_types import short_names
 from slam_observer_ros.settings.parameter_table import parameter
 
 AUTO = 'auto'
@@ -39,17 +40,7 @@ class InputSettings:
         AUTO,
         'Message type on landmarks; auto takes the type found on the topic, tf takes fiducials '
         'that a detector publishes on /tf',
-        choices=(
-            AUTO,
-            'PointCloud',
-            'PointCloud2',
-            'PoseArray',
-            'Detection3DArray',
-            'AprilTagDetectionArray',
-            'ArucoDetection',
-            'ArucoMarkers',
-            ON_TF,
-        ),
+        choices=lambda: (AUTO, *short_names('landmarks'), ON_TF),
         basic=True,
     )
     tag_frame_prefix: str = parameter(

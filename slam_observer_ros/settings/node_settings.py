@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam_observer_ros.settings.input_settings import AUTO, InputSettings
+from slam_observer_ros.settings.message_types import short_names
 from slam_observer_ros.settings.parameter_table import parameter
 
 
@@ -15,7 +16,7 @@ class ObserverNodeSettings(InputSettings):
     velocity_type: str = parameter(
         AUTO,
         'Message type on twist; auto takes the type found on the topic',
-        choices=(AUTO, 'Twist', 'TwistStamped', 'TwistWithCovarianceStamped', 'Odometry'),
+        choices=lambda: (AUTO, *short_names('velocity')),
         basic=True,
     )
     twist_qos: str = parameter(

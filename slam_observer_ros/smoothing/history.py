@@ -14,6 +14,7 @@ from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
 from slam_observer_ros.smoothing.keyframes import (
@@ -120,16 +121,32 @@ class History:
 
     def move(self, motion: Motion) -> None:
         """Append a motion to the one that leads to the next keyframe; a slip comes last."""
-        if self._start is None:
-            self._start = self._end = motion.path[0].copy()
+        self.begin(motion.path[0])
         if motion.is_slip:
             self._slip = motion
             return
-        self._end = motion.path[-1].copy()  # not a view, which would keep all of the path
-        self._motion_noise = self._motion_noise + motion.noise
-        self._sensitivity = self._sensitivity + motion.sensitivity
-        self._drift = self._drift + motion.drift
-        self._calibration = motion.calibration.values
+        end, noise, sensitivity = motion.path[-1], motion.noise, motion.sensitivity
+        self.move_on(end, noise, sensitivity, motion.drift, motion.calibration)
+
+    def move_on(
+        self,
+        end: FloatArray,
+        noise: FloatArray,
+        sensitivity: FloatArray,
+        drift: FloatArray,
+        calibration: Calibration,
+    ) -> None:
+        """Append a motion to a pose ``end`` (4, 4), with what :class:`.Motion` has of it."""
+        self._end = end.copy()  # not a view, which would keep all of a path
+        self._motion_noise = self._motion_noise + noise
+        self._sensitivity = self._sensitivity + sensitivity
+        self._drift = self._drift + drift
+        self._calibration = calibration.values
+
+    def begin(self, pose: FloatArray) -> None:
+        """Note the pose (4, 4) from where the motion to the next keyframe begins."""
+        if self._start is None:
+            self._start = self._end = pose.copy()
 
     def add(self, keyframe: Keyframe, pose: FloatArray, calibration: FloatArray) -> None:
         """Append a keyframe, seen from ``pose`` (4, 4), with what is known of (c,) then."""

@@ -84,7 +84,8 @@ class JointFilter(Protocol):
     calibration: Calibration
     axes: EstimatedAxes
     joint: JointCovariance | None
-    orientations: LandmarkOrientations | None
+    orientations: LandmarkOrientations
+    estimates_orientations: bool
 
 
 class Relinearisation:
@@ -196,10 +197,10 @@ class Relinearisation:
             self.history.summarise(self._known().least_nonlinear(self._axes)[0])
             self._clear_counts()
 
-    def smooth(self) -> tuple[Solution, int]:
-        """Return all smoothed estimates, and how many slips they confirm (:mod:`.slips`).
+    def smooth(self) -> tuple[Step, int]:
+        """Return the last step of smoothing, and how many slips it confirms (:mod:`.slips`).
 
-        They are iterated from the present ones, which stay as they are. Raise
+        Its estimates are iterated from the present ones, which stay as they are. Raise
         :exc:`ParameterError` if what the smoother takes for constant is not, or no history is
         kept, :exc:`SmoothingError` if the observations don't determine everything.
         """
@@ -212,7 +213,7 @@ class Relinearisation:
                 'covariances that say they are exact'
             ) from error
 
-    def _smoothed(self) -> tuple[Solution, int]:
+    def _smoothed(self) -> tuple[Step, int]:
         prior, keyframes = self.history.prior, self.history.keyframes()
         start, slips = self._solution_from(0), 0
 
@@ -228,8 +229,7 @@ class Relinearisation:
             keyframes, slips = keyframes.with_slips(are_slips), int(np.sum(are_slips))
         smoother = self._smoother(prior, keyframes)
         start = self._without_outliers_of_then(smoother, start)
-        smoothed = smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE)
-        return smoothed.end, slips
+        return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE), slips
 
     def _check_smoothable(self) -> None:
         if self._settings.relinearization_interval == 0:
@@ -328,9 +328,8 @@ class Relinearisation:
         self._calibration.shift(end.calibrations[-1] - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)
-        tags = self._filter.orientations
-        if tags is not None and end.orientations is not None:
-            tags.B[...] = end.orientations
+        if end.orientations is not None:
+            self._filter.orientations.B[...] = end.orientations
 
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
         calibration, sensed = self._calibration, None
@@ -368,8 +367,8 @@ class Relinearisation:
 
     def _orientations(self) -> FloatArray | None:
         """Return those of the landmarks (n, 3, 3), if they are estimated."""
-        tags = self._filter.orientations
-        return None if tags is None else tags.B.copy()
+        filter_ = self._filter
+        return filter_.orientations.B.copy() if filter_.estimates_orientations else None
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:

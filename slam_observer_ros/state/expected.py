@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 
 import numpy as np
 
@@ -12,9 +11,8 @@ from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.step import LOG_ROOT_2_PI
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
-
-_LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +45,7 @@ class Expected:
             # One after the other, each as those before it have it: the product is that of all.
             white = np.linalg.solve(L, self.r.ravel()[rows])
             nis = float(white @ white)
-            each = 0.5 * white**2 + np.log(np.diagonal(L)) + _LOG_ROOT_2_PI
+            each = 0.5 * white**2 + np.log(np.diagonal(L)) + LOG_ROOT_2_PI
             log_densities[used] = -each.reshape(-1, k).sum(axis=1)
         return NormalisedInnovation(
             self.distances,

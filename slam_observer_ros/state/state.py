@@ -11,7 +11,9 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.matrices import correlations_of
 from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
@@ -178,15 +180,9 @@ class State:
         if self.relinearisation is not None:
             self.relinearisation.add_calibration()
 
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        noise: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
-        """Take landmarks (m,) for new ones seen at ``points`` (m, 3), body frame."""
-        self.filter.relocate(rows, points, noise, D)
+    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
+        """Take landmarks (m,) for new ones."""
+        self.filter.relocate(rows, seen)
         if self.relinearisation is not None:
             self.relinearisation.relocate(rows)
 
@@ -231,7 +227,11 @@ class State:
                 "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
             )
         # From the reference frame to the world.
-        (found, slips), rows = self.relinearisation.smooth(), self.confirmed
+        (step, slips), rows = self.relinearisation.smooth(), self.confirmed
+        found, calibration = step.end, self.filter.calibration.copy()
+        entries = slice(self.axes.p, self.axes.p + calibration.count)
+        covariance = step.marginal()[entries, entries]
+        calibration.shift(found.calibrations[-1] - calibration.values)
         history, P = self.relinearisation.history, self.observer.reference_pose
         turned = found.orientations
         return Smoothed(
@@ -242,4 +242,6 @@ class State:
             since=history.since,
             slips=slips,
             orientations=None if turned is None else P[:3, :3] @ turned[rows],
+            calibration=calibration.estimates(np.diagonal(covariance)),
+            calibration_correlations=correlations_of(covariance),
         )

@@ -25,6 +25,7 @@ from slam_observer_ros.simulation import Scenario, Simulation
 
 REPORT_KEYS = {
     'lost', 'recording', 'recording_sha256', 'version', 'settings', 'warnings', 'nis',
+    'findings',
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
     'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
     'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',
@@ -104,8 +105,8 @@ def without(kind):
 @pytest.mark.parametrize(
     ('kind', 'sentence'),
     [
-        (ObservationEvent, 'No observation was used: the trajectory is that of the velocities'),
-        (VelocityEvent, 'No velocity was used: the landmarks alone move the robot.'),
+        (ObservationEvent, 'No observation was used (dropped: 50 without a point that is used)'),
+        (VelocityEvent, 'No velocity was used (dropped: 100 not_finite)'),
         ((VelocityEvent, ObservationEvent), 'Nothing was used, neither a velocity nor'),
     ],
 )
@@ -349,8 +350,8 @@ class TestPoints:
         ended = slam_observer(*arguments, 'constant')
         assert '0 used, 150 without id (100.0 %)' in ended.output
         assert (
-            'slam-observer: warning: Points without an id are not used by constant gains, '
-            'only by riccati (1 so far).\n'
+            'slam-observer: warning: Points without an id are not used by constant gains '
+            '(1 so far): only riccati gains use them.\n'
         ) in ended.errors
         assert '150 used' in slam_observer.succeed(*arguments, 'riccati').output
 

@@ -875,8 +875,8 @@ def test_landmarks_that_move_again_and_again_are_reported_ever_more_seldom(caplo
     events.sort(key=lambda event: event.stamp_ns)
     estimator = run(events, gains='riccati')
     assert 10 <= estimator.counts['moved_landmark'] < 100
-    reported = [text for text in caplog.messages if 'moved' in text]
-    assert reported == [f'Landmarks [2] have moved ({times} so far).' for times in (1, 10)]
+    reported = [text.partition(':')[0] for text in caplog.messages if 'moved' in text]
+    assert reported == [f'Landmarks [2] have moved ({times} so far)' for times in (1, 10)]
 
 
 @pytest.mark.parametrize('gains', GAINS)

@@ -8,11 +8,12 @@ import numpy as np
 import ros_messages as ros
 from rosbags.typesys import get_types_from_msg
 
-from slam_observer_ros.recording.definitions import DEFINITIONS
+from slam_observer_ros.settings.message_types import message_types
 
 NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
-for type_name, text in DEFINITIONS.items():
-    ros.TYPESTORE.register(get_types_from_msg(text, type_name))
+for known in message_types('landmarks').values():
+    if known.definition:
+        ros.TYPESTORE.register(get_types_from_msg(known.definition, known.name))
 
 
 def pose_array(

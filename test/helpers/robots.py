@@ -12,7 +12,7 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.messages.poses_and_velocities import pose_matrices
+from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.simulation import Simulation
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import logging
 
 import numpy as np
@@ -14,9 +15,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import drop_reason, EventBuilder, MAX_WAITING
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.poses_and_velocities import PoseMessage
+from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.settings.input_settings import InputSettings
 
 MS = 1_000_000
@@ -40,12 +39,18 @@ class Wheel:
         for _ in range(count):
             self.now_ns += 20 * MS
             events += self.builder.retry(self.now_ns)
-            message = Measurement('wheel', VelocityEvent(self.now_ns, V))
+            message = VelocityEvent(self.now_ns, V, sensor_frame='wheel')
             events += self.builder.add(message, self.now_ns)
         return events
 
     def insert_transform(self, stamp_ns):
         self.transforms.insert('base_link', 'wheel', stamp_ns, WHEEL)
+
+
+def tags_seen(frame, *ids):
+    ids = ids or (3,)
+    unknown, families = np.full((len(ids), 3), np.nan), ('tag36h11',) * len(ids)
+    return ObservationEvent(0, np.array(ids), unknown, sensor_frame=frame, families=families)
 
 
 def of_base(stamp_ns):
@@ -102,9 +107,9 @@ def test_what_too_many_wait_behind_is_dropped_and_reported():
     transforms = TransformBuffer()
     builder = EventBuilder(BaseFrame(InputSettings(), transforms), 10.0, 0.5, drops.append)
     for k in range(MAX_WAITING + 3):
-        observation = ObservationEvent(k * MS, np.array([1]), np.ones((1, 3)))
         frame = 'lidar' if k == MAX_WAITING else 'camera'
-        assert not builder.add(Measurement(frame, observation), k * MS)
+        seen = ObservationEvent(k * MS, np.array([1]), np.ones((1, 3)), sensor_frame=frame)
+        assert not builder.add(seen, k * MS)
     assert not builder.retry(MAX_WAITING * MS)
     assert len(drops) == 3
     assert f'more than {MAX_WAITING} measurements wait' in str(drops[0])
@@ -131,19 +136,19 @@ def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
     reason = "given in 'map', which is estimated from these very landmarks: publish them in the"
     base_frame = BaseFrame(InputSettings(), everything_placed())
     with pytest.raises(TransformError, match=reason):
-        base_frame.observation(event, frame)
+        base_frame.observation(replace(event, sensor_frame=frame))
     with pytest.raises(TransformError, match=reason):
-        base_frame.tags(TagDetections(0, frame, (3,), ('tag36h11',)))
+        base_frame.observation(tags_seen(frame))
     with pytest.raises(TransformError, match=reason):
         settings = InputSettings(sensor_frame=frame)
-        BaseFrame(settings, everything_placed()).observation(event, 'camera')
+        BaseFrame(settings, everything_placed()).observation(replace(event, sensor_frame='camera'))
 
 
 def test_tags_are_those_of_the_sensor_that_a_parameter_names():
-    camera, other = (TagDetections(0, frame, (3,), ('tag36h11',)) for frame in ('camera', 'lens'))
-    expected = BaseFrame(InputSettings(), everything_placed()).tags(camera)
+    camera, other = map(tags_seen, ('camera', 'lens'))
+    expected = BaseFrame(InputSettings(), everything_placed()).observation(camera)
     base_frame = BaseFrame(InputSettings(sensor_frame='camera'), everything_placed())
-    assert_allclose(base_frame.tags(other).points, expected.points)
+    assert_allclose(base_frame.observation(other).points, expected.points)
 
 
 def test_a_tag_on_tf_that_is_exactly_not_turned_has_no_orientation():
@@ -152,8 +157,8 @@ def test_a_tag_on_tf_that_is_exactly_not_turned_has_no_orientation():
     unset = se3.pose(np.eye(3), np.array([2.0, 0.0, 0.0]))
     for child, pose in (('tag_3', unset), ('tag_4', WHEEL)):
         transforms.insert('camera', child, 0, pose, is_static=True)
-    detections = TagDetections(0, 'camera', (3, 4), ('tag36h11', 'tag36h11'))
-    event = BaseFrame(InputSettings(), transforms).tags(detections)
+    event = BaseFrame(InputSettings(), transforms).observation(tags_seen('camera', 3, 4))
+    assert event.families is None
     assert_array_equal(event.orientations[0], np.zeros((3, 3)))
     assert_allclose(event.orientations[1], (CAMERA @ WHEEL)[:3, :3])
     assert_allclose(event.points, se3.transform(CAMERA, np.stack([unset, WHEEL])[:, :3, 3]))
@@ -162,10 +167,10 @@ def test_a_tag_on_tf_that_is_exactly_not_turned_has_no_orientation():
 def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used():
     event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
     base_frame = BaseFrame(InputSettings(), everything_placed())
-    moved = base_frame.observation(event, 'odom')
+    moved = base_frame.observation(replace(event, sensor_frame='odom'))
     assert_allclose(moved.points, se3.transform(se3.inverse(WHEEL), event.points))
     settings = InputSettings(sensor_pose=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
-    placed = BaseFrame(settings, TransformBuffer()).observation(event, 'map')
+    placed = BaseFrame(settings, TransformBuffer()).observation(replace(event, sensor_frame='map'))
     assert_allclose(placed.points, [[1.0, 1.0, 2.0]])
 
 
@@ -183,7 +188,7 @@ def test_landmarks_name_their_sensor_and_the_axis_along_which_it_looks(frame, ca
     for sensor in ('camera', 'camera_optical'):
         transforms.insert('base_link', sensor, 0, CAMERA, is_static=True)
     event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
-    seen = BaseFrame(InputSettings(), transforms).observation(event, frame)
+    seen = BaseFrame(InputSettings(), transforms).observation(replace(event, sensor_frame=frame))
     assert seen.sensor_frame == called
     R = CAMERA[:3, :3] if called else np.eye(3)
     assert_allclose(seen.sensor_axis, R @ np.array(axis))
@@ -203,14 +208,14 @@ def test_frames_of_another_prefix_point_at_the_base_frame(base, frame, meant):
     frames = BaseFrame(InputSettings(base_frame=base), TransformBuffer())
     event = ObservationEvent(1, np.array([1]), np.ones((1, 3)))
     with pytest.raises(TransformError, match='not connected') as raised:
-        frames.observation(event, frame)
+        frames.observation(replace(event, sensor_frame=frame))
     assert ('base_frame' in str(raised.value)) == (meant is not None)
     assert (meant or '') in str(raised.value)
 
 
 def test_without_an_odometry_frame_velocities_may_name_none():
     event = VelocityEvent(0, V)
-    assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(event, '')
+    assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(event)
 
 
 def test_a_jump_of_the_odometrys_pose_is_dropped_by_a_reason_of_its_own():

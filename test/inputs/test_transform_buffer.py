@@ -15,7 +15,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import insert_transforms
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
-from slam_observer_ros.messages.poses_and_velocities import decode_transforms
+from slam_observer_ros.messages.poses import decode_transforms
 
 NO_TURN = [0.0, 0.0, 0.0, 1.0]
 SECOND = 1_000_000_000

@@ -15,19 +15,9 @@ import ros_messages as ros
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.messages import cloud_fields, point_clouds
-from slam_observer_ros.messages import poses_and_velocities as messages
-from slam_observer_ros.messages.detections import decode_apriltags
-from slam_observer_ros.messages.message_types import (
-    APRILTAGS,
-    CLOUD_DECODERS,
-    DETECTION_DECODERS,
-    IMU,
-    POSE_DECODERS,
-    TRANSFORMS,
-    VELOCITY_DECODERS,
-)
+from slam_observer_ros.messages import cloud_fields, clouds, poses, velocities
 from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.messages.registry import decoders
 from slam_observer_ros.messages.state_messages import (
     encode_transform,
     StateMessages,
@@ -66,17 +56,17 @@ class TestVelocities:
     @given(TWISTS, ENDIANNESS)
     def test_twist_has_the_time_of_its_reception(self, velocity, little_endian):
         raw = ros.serialise(ros.twist(velocity), little_endian)
-        message = messages.decode_twist(raw, 42)
-        assert (message.frame_id, message.event.stamp_ns) == ('', 42)
-        np.testing.assert_array_equal(message.event.body_velocity, velocity)
+        message = velocities.decode_twist(raw, 42)
+        assert (message.sensor_frame, message.stamp_ns) == ('', 42)
+        np.testing.assert_array_equal(message.body_velocity, velocity)
 
     @given(TWISTS, FRAMES, ENDIANNESS)
     def test_twist_stamped(self, velocity, frame_id, little_endian):
         raw = ros.serialise(ros.twist_stamped(velocity, frame_id), little_endian)
-        message = messages.decode_twist_stamped(raw, 42)
-        assert (message.frame_id, message.event.stamp_ns) == (frame_id, ros.STAMP_NS)
-        np.testing.assert_array_equal(message.event.body_velocity, velocity)
-        assert message.event.covariance is None
+        message = velocities.decode_twist_stamped(raw, 42)
+        assert (message.sensor_frame, message.stamp_ns) == (frame_id, ros.STAMP_NS)
+        np.testing.assert_array_equal(message.body_velocity, velocity)
+        assert message.covariance is None
 
     @given(TWISTS, FRAMES, ENDIANNESS)
     def test_twist_with_covariance_stamped(self, velocity, frame_id, little_endian):
@@ -85,47 +75,47 @@ class TestVelocities:
         )
         message_type = 'geometry_msgs/msg/TwistWithCovarianceStamped'
         raw = ros.serialise(ros.make(message_type, ros.header(frame_id), twist), little_endian)
-        message = VELOCITY_DECODERS[message_type](raw, 42)
-        np.testing.assert_array_equal(message.event.body_velocity, velocity)
-        np.testing.assert_array_equal(message.event.covariance, ANGULAR_FIRST_COVARIANCE)
+        message = velocities.decode_twist_with_covariance_stamped(raw, 42)
+        np.testing.assert_array_equal(message.body_velocity, velocity)
+        np.testing.assert_array_equal(message.covariance, ANGULAR_FIRST_COVARIANCE)
 
     @given(TWISTS, FRAMES, FRAMES, ENDIANNESS)
     def test_odometry_twist_is_in_its_child_frame(self, velocity, parent, child, little_endian):
         odometry = ros.odometry(velocity, COVARIANCE, frames=(parent, child))
         raw = ros.serialise(odometry, little_endian)
-        message = messages.decode_odometry_twist(raw, 42)
-        assert (message.frame_id, message.event.stamp_ns) == (child, ros.STAMP_NS)
-        np.testing.assert_array_equal(message.event.body_velocity, velocity)
-        np.testing.assert_array_equal(message.event.covariance, ANGULAR_FIRST_COVARIANCE)
+        message = velocities.decode_odometry_twist(raw, 42)
+        assert (message.sensor_frame, message.stamp_ns) == (child, ros.STAMP_NS)
+        np.testing.assert_array_equal(message.body_velocity, velocity)
+        np.testing.assert_array_equal(message.covariance, ANGULAR_FIRST_COVARIANCE)
 
     def test_odometry_without_a_pose_still_gives_its_twist(self):
         raw = ros.serialise(ros.odometry([1.0] * 6, COVARIANCE, quaternion=[0.0] * 4))
-        assert messages.decode_odometry_twist(raw).event.body_velocity.tolist() == [1.0] * 6
+        assert velocities.decode_odometry_twist(raw).body_velocity.tolist() == [1.0] * 6
 
     @pytest.mark.parametrize('first', [0.0, -1.0])
     def test_unknown_covariance_is_none(self, first):
         covariance = np.zeros((6, 6))
         covariance[0, 0] = first
         raw = ros.serialise(ros.odometry([1.0] * 6, covariance))
-        assert messages.decode_odometry_twist(raw).event.covariance is None
-        assert messages.decode_odometry_pose(raw).covariance is None
+        assert velocities.decode_odometry_twist(raw).covariance is None
+        assert velocities.decode_odometry_pose(raw).covariance is None
 
     def imu(self, covariance: np.ndarray) -> bytes:
         return ros.serialise(ros.imu([1.0, 2.0, 3.0], covariance))
 
     def test_imu_gives_angular_velocity(self):
         covariance = np.arange(1.0, 10.0).reshape(3, 3)
-        message = messages.decode_imu(self.imu(covariance))
-        assert (message.stamp_ns, message.frame_id) == (ros.STAMP_NS, 'imu')
-        assert message.event.angular_velocity.tolist() == [1.0, 2.0, 3.0]
-        np.testing.assert_array_equal(message.event.covariance, covariance)
-        assert messages.decode_imu(self.imu(np.zeros((3, 3)))).event.covariance is None
+        message = velocities.decode_imu(self.imu(covariance))
+        assert (message.stamp_ns, message.sensor_frame) == (ros.STAMP_NS, 'imu')
+        assert message.angular_velocity.tolist() == [1.0, 2.0, 3.0]
+        np.testing.assert_array_equal(message.covariance, covariance)
+        assert velocities.decode_imu(self.imu(np.zeros((3, 3)))).covariance is None
 
     def test_imu_without_a_gyroscope_is_refused(self):
         covariance = np.zeros((3, 3))
         covariance[0, 0] = -1.0
         with pytest.raises(MessageError, match='no angular velocity'):
-            messages.decode_imu(self.imu(covariance))
+            velocities.decode_imu(self.imu(covariance))
 
 
 class TestPoses:
@@ -150,9 +140,9 @@ class TestPoses:
                 [0.0] * 6, COVARIANCE, self.POSITION, self.QUATERNION, (frame_id, 'base')
             ),
         ]
-        assert {message.__msgtype__ for message in built} == set(POSE_DECODERS)
+        assert {message.__msgtype__ for message in built} == set(decoders('pose'))
         for message in built:
-            decoded = POSE_DECODERS[message.__msgtype__](ros.serialise(message, little_endian))
+            decoded = decoders('pose')[message.__msgtype__](ros.serialise(message, little_endian))
             assert (decoded.stamp_ns, decoded.frame_id) == (ros.STAMP_NS, frame_id)
             assert decoded.child_frame_id == getattr(message, 'child_frame_id', '')
             np.testing.assert_allclose(decoded.pose, self.EXPECTED, atol=1e-15)
@@ -165,7 +155,7 @@ class TestPoses:
         transforms = [ros.transform_stamped(f, self.POSITION, self.QUATERNION) for f in frames]
         # tf2_msgs/TFMessage is one sequence of transforms, as is the transforms field here.
         raw = ros.serialise(ros.make('tf2_msgs/msg/TFMessage', transforms), little_endian)
-        decoded = messages.decode_transforms(raw)
+        decoded = poses.decode_transforms(raw)
         assert [(t.frame_id, t.child_frame_id) for t in decoded] == frames
         for transform in decoded:
             np.testing.assert_allclose(transform.pose, self.EXPECTED, atol=1e-15)
@@ -177,7 +167,7 @@ class TestPoses:
         pose = ros.pose(self.POSITION, quaternion)
         raw = ros.serialise(ros.make('geometry_msgs/msg/PoseStamped', ros.header('map'), pose))
         with pytest.raises(MessageError, match='quaternion'):
-            messages.decode_pose_stamped(raw)
+            poses.decode_pose_stamped(raw)
 
 
 class TestPointCloud:
@@ -196,29 +186,29 @@ class TestPointCloud:
         table = np.array(rows, dtype=float).reshape(-1, 4)
         channels = {other_channel: np.zeros(2), 'id': table[:, 0]}
         raw = ros.serialise(ros.point_cloud(table[:, 1:], channels, frame_id), little_endian)
-        message = CLOUD_DECODERS['sensor_msgs/msg/PointCloud'](raw, 42)
-        assert (message.frame_id, message.event.stamp_ns) == (frame_id, ros.STAMP_NS)
-        np.testing.assert_array_equal(message.event.ids, table[:, 0])
-        np.testing.assert_array_equal(message.event.points, table[:, 1:])
+        message = clouds.decode_point_cloud(raw, 42)
+        assert (message.sensor_frame, message.stamp_ns) == (frame_id, ros.STAMP_NS)
+        np.testing.assert_array_equal(message.ids, table[:, 0])
+        np.testing.assert_array_equal(message.points, table[:, 1:])
         assert 'id' in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
 
     def test_without_the_channel_all_ids_are_unknown(self):
         raw = ros.serialise(ros.point_cloud(np.ones((3, 3)), {'intensity': np.ones(3)}))
-        assert point_clouds.decode_point_cloud(raw).event.ids.tolist() == [-1, -1, -1]
+        assert clouds.decode_point_cloud(raw).ids.tolist() == [-1, -1, -1]
         assert 'id' not in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
 
     @pytest.mark.parametrize('bad_id', [0.5, -2.0, np.nan, np.inf, 2.0**24])
     def test_a_point_whose_id_float32_cannot_hold_is_marked_and_the_others_are_taken(self, bad_id):
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.array([1, bad_id])}))
-        assert point_clouds.decode_point_cloud(raw).event.ids.tolist() == [1, IMPOSSIBLE_ID]
+        assert clouds.decode_point_cloud(raw).ids.tolist() == [1, IMPOSSIBLE_ID]
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.array([bad_id, bad_id])}))
         with pytest.raises(MessageError, match='not a whole number'):
-            point_clouds.decode_point_cloud(raw)
+            clouds.decode_point_cloud(raw)
 
     def test_id_channel_of_another_length_is_refused(self):
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.ones(3)}))
         with pytest.raises(MessageError, match='3 ids for 2 points'):
-            point_clouds.decode_point_cloud(raw)
+            clouds.decode_point_cloud(raw)
 
     @given(FRAMES, st.integers(0, 5))
     def test_encoder_writes_what_the_ros_serialiser_writes(self, frame_id, count):
@@ -259,10 +249,10 @@ class TestPointCloud2:
         )
         cloud = records(dtype, shape)
         raw = ros.serialise(ros.point_cloud2(cloud, frame_id, row_padding=gap), little_endian)
-        message = point_clouds.decode_point_cloud2(raw, 42)
-        assert (message.frame_id, message.event.stamp_ns) == (frame_id, ros.STAMP_NS)
-        np.testing.assert_array_equal(message.event.ids, 7 + np.arange(cloud.size))
-        np.testing.assert_array_equal(message.event.points, points_of(cloud))
+        message = clouds.decode_point_cloud2(raw, 42)
+        assert (message.sensor_frame, message.stamp_ns) == (frame_id, ros.STAMP_NS)
+        np.testing.assert_array_equal(message.ids, 7 + np.arange(cloud.size))
+        np.testing.assert_array_equal(message.points, points_of(cloud))
         assert 'id' in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud2').names
 
     @given(st.integers(0, 5), st.booleans(), st.booleans())
@@ -282,7 +272,7 @@ class TestPointCloud2:
             velocities if with_velocities else None,
         )
         raw = ros.serialise(cloud)
-        event = point_clouds.decode_point_cloud2(raw).event
+        event = clouds.decode_point_cloud2(raw)
         np.testing.assert_array_equal(event.ids, ids)
         np.testing.assert_array_equal(event.points, points)
         if with_covariances and count:
@@ -311,19 +301,19 @@ class TestPointCloud2:
 
     def test_empty_cloud_needs_no_fields(self):
         raw = ros.serialise(ros.point_cloud2(np.zeros((0, 0), np.dtype([('q', 'f4')]))))
-        event = point_clouds.decode_point_cloud2(raw).event
+        event = clouds.decode_point_cloud2(raw)
         assert event.points.shape == (0, 3)
         assert event.ids.shape == (0,)
 
     def test_without_ids_all_are_unknown(self):
         cloud = records(np.dtype([(name, '<f4') for name in 'xyz']))
-        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        event = clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
         assert event.ids.tolist() == [-1, -1, -1]
 
     def test_zero_covariances_are_unknown(self):
-        names = ['x', 'y', 'z', *point_clouds.COVARIANCE_NAMES]
+        names = ['x', 'y', 'z', *clouds.COVARIANCE_NAMES]
         cloud = np.zeros((1, 2), [(name, '<f4') for name in names])
-        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        event = clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
         assert event.covariances is None
 
     @pytest.mark.parametrize('id_type', ['<u4', '<f4'])
@@ -331,24 +321,22 @@ class TestPointCloud2:
         signalling_nan = np.uint32(0x7F800001).view(np.float32)
         points = np.full((1, 2), 0, [*POINT_TYPE.descr[:3], ('id', id_type)])
         points['y'] = signalling_nan
-        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(points))).event
+        event = clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(points)))
         assert event.points.shape == (0, 3)
         cloud = ros.point_cloud(np.full((1, 3), signalling_nan), {})
-        event = point_clouds.decode_point_cloud(ros.serialise(cloud)).event
+        event = clouds.decode_point_cloud(ros.serialise(cloud))
         assert event.points.shape == (0, 3)
 
     @pytest.mark.parametrize('is_dense', [True, False])
     @pytest.mark.parametrize('unmeasured', [np.nan, np.inf, -np.inf])
     def test_unmeasured_points_are_left_out_and_the_others_used(self, is_dense, unmeasured):
-        names = [*point_clouds.COVARIANCE_NAMES, *point_clouds.VELOCITY_NAMES]
+        names = [*clouds.COVARIANCE_NAMES, *clouds.VELOCITY_NAMES]
         cloud = records(np.dtype([*POINT_TYPE.descr, *((name, '<f4') for name in names)]))
         whole = ros.serialise(ros.point_cloud2(cloud))
         cloud['y'][0, 1] = unmeasured
         sparse = ros.serialise(ros.point_cloud2(cloud, is_dense=is_dense))
-        event = point_clouds.decode_point_cloud2(sparse).event
-        expected = point_clouds.decode_point_cloud2(whole).event.select(
-            np.array([True, False, True])
-        )
+        event = clouds.decode_point_cloud2(sparse)
+        expected = clouds.decode_point_cloud2(whole).select(np.array([True, False, True]))
         assert event.ids.tolist() == [7, 9]
         for name in ('points', 'covariances', 'velocities'):
             np.testing.assert_array_equal(getattr(event, name), getattr(expected, name))
@@ -361,7 +349,7 @@ class TestPointCloud2:
         cloud = records(dtype, (2, 3))
         cloud['x'][:, 1], cloud['id'][:, 1] = np.nan, junk
         raw = ros.serialise(ros.point_cloud2(cloud, row_padding=5))
-        event = point_clouds.decode_point_cloud2(raw).event
+        event = clouds.decode_point_cloud2(raw)
         assert event.ids.tolist() == [7, 9, 10, 12]
         np.testing.assert_array_equal(event.points, points_of(cloud)[[0, 2, 3, 5]])
 
@@ -369,12 +357,12 @@ class TestPointCloud2:
     def test_unmeasured_points_of_a_point_cloud_may_have_any_id(self, junk):
         points = np.array([[1.0, 2.0, 3.0], [np.inf] * 3])
         raw = ros.serialise(ros.point_cloud(points, {'id': np.array([7, junk])}))
-        assert point_clouds.decode_point_cloud(raw).event.ids.tolist() == [7]
+        assert clouds.decode_point_cloud(raw).ids.tolist() == [7]
 
     def test_unmeasured_points_of_a_point_cloud_are_left_out(self):
         points = np.array([[1.0, 2.0, 3.0], [np.nan] * 3, [4.0, 5.0, 6.0]])
         raw = ros.serialise(ros.point_cloud(points, {'id': np.array([7, 8, 9])}))
-        event = point_clouds.decode_point_cloud(raw).event
+        event = clouds.decode_point_cloud(raw)
         assert event.ids.tolist() == [7, 9]
         np.testing.assert_array_equal(event.points, points[[0, 2]])
 
@@ -390,7 +378,7 @@ class TestPointCloud2:
     def test_missing_or_mistyped_field_is_named(self, fields, reason):
         raw = ros.serialise(ros.point_cloud2(records(np.dtype(fields))))
         with pytest.raises(MessageError, match=reason):
-            point_clouds.decode_point_cloud2(raw)
+            clouds.decode_point_cloud2(raw)
 
     @pytest.mark.parametrize(
         ('id_type', 'largest'), [('<f4', 2**24 - 1), ('>f8', MAX_ID), ('<f8', MAX_ID)]
@@ -399,24 +387,24 @@ class TestPointCloud2:
         dtype = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('id', id_type)])
         cloud = records(dtype.newbyteorder(id_type[0]))
         cloud['id'][0] = [-1, largest - 1, largest]
-        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        event = clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
         assert event.ids.tolist() == [-1, largest - 1, largest]
         cloud['id'][0, 2] = largest + 1
-        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        event = clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
         assert event.ids.tolist() == [-1, largest - 1, IMPOSSIBLE_ID]
         cloud['id'][0] = largest + 1
         reason = f'landmark id {largest + 1} .* whole number from -1 to {largest}$'
         with pytest.raises(MessageError, match=reason):
-            point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
+            clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
 
     def test_a_point_with_a_negative_id_is_marked_and_clouds_of_them_are_refused(self):
         cloud = records(np.dtype([('x', 'f4'), ('y', 'f4'), ('z', 'f4'), ('id', 'i4')]))
         cloud['id'][0, 2] = -5
-        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        event = clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
         assert (event.ids == IMPOSSIBLE_ID).tolist() == [False, False, True]
         cloud['id'][0] = -5
         with pytest.raises(MessageError, match='negative landmark id -5'):
-            point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
+            clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
 
     @pytest.mark.parametrize(
         ('change', 'reason'),
@@ -435,18 +423,13 @@ class TestPointCloud2:
         for name, value in change.items():
             setattr(cloud, name, value)
         with pytest.raises(MessageError, match=reason):
-            point_clouds.decode_point_cloud2(ros.serialise(cloud))
+            clouds.decode_point_cloud2(ros.serialise(cloud))
 
 
+ROLES = ('velocity', 'angular velocity', 'landmarks', 'pose')
 DECODERS = {
-    **{(name, 'velocity'): decode for name, decode in VELOCITY_DECODERS.items()},
-    **{(name, 'landmarks'): d for name, d in (CLOUD_DECODERS | DETECTION_DECODERS).items()},
-    **{
-        (name, 'pose'): (lambda raw, _, d=decode: d(raw)) for name, decode in POSE_DECODERS.items()
-    },
-    (IMU, 'imu'): lambda raw, _: messages.decode_imu(raw),
-    (TRANSFORMS, 'tf'): lambda raw, _: messages.decode_transforms(raw),
-    (APRILTAGS, 'tags'): lambda raw, _: decode_apriltags(raw),
+    **{(name, role): decode for role in ROLES for name, decode in decoders(role).items()},
+    (poses.TRANSFORMS, 'tf'): poses.decode_transforms,
 }
 
 
@@ -518,12 +501,12 @@ class TestMalformed:
             assert str(error)
 
     @all_decoders
-    def test_thousands_of_mutations_never_raise_anything_else(self, key):
+    def test_a_thousand_mutations_never_raise_anything_else(self, key):
         """Lengths, numbers and texts that no publisher sends, in any place."""
         random = np.random.default_rng(list(key[0].encode()))
         words = [0, 1, 0x7F, 0xFF, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 0x7F800000, 0x7FC00000]
         whole = np.frombuffer(EXAMPLES[key[0]], np.uint8)
-        for _ in range(4000):
+        for _ in range(1000):
             raw = whole.copy()
             for _ in range(random.integers(1, 5)):
                 at = random.integers(len(raw) - 4)
@@ -537,13 +520,13 @@ class TestMalformed:
     def test_other_encapsulations_are_refused(self):
         raw = b'\0\x03' + EXAMPLES['geometry_msgs/msg/Twist'][2:]
         with pytest.raises(MessageError, match='not plain CDR'):
-            messages.decode_twist(raw, 0)
+            velocities.decode_twist(raw, 0)
 
     def test_huge_sequence_length_allocates_nothing(self):
         raw = bytearray(ros.serialise(ros.point_cloud(np.zeros((0, 3)), {}, '')))
         raw[-8:-4] = struct.pack('<I', 2**32 - 1)
         with pytest.raises(MessageError, match='too short'):
-            point_clouds.decode_point_cloud(bytes(raw))
+            clouds.decode_point_cloud(bytes(raw))
 
 
 def outgoing_messages(make):
@@ -571,7 +554,7 @@ def outgoing_messages(make):
 @pytest.mark.parametrize('covariance', [ANGULAR_FIRST_COVARIANCE, None])
 def test_a_covariance_that_is_sent_is_read_again(covariance):
     raw = StateMessages('map', '').pose(ros.STAMP_NS, uncertain_pose(np.eye(4), covariance))
-    read = messages.decode_pose_with_covariance_stamped(raw).covariance
+    read = poses.decode_pose_with_covariance_stamped(raw).covariance
     if covariance is None:
         assert read is None
     else:
@@ -620,9 +603,9 @@ def test_rclpy_serialises_the_same_bytes():
         raw = ros.serialise(recorded)
         assert serialization.deserialize_message(raw, type(message)) == message
     published = [serialization.serialize_message(message) for message in messages_of_rclpy]
-    decoded = messages.decode_twist_stamped(published[-3])
-    assert (decoded.frame_id, decoded.event.stamp_ns) == ('base_link', ros.STAMP_NS)
-    assert decoded.event.body_velocity.tolist() == [0.0, 0.0, -0.5, 1.5, 0.0, 0.0]
-    event = point_clouds.decode_point_cloud2(published[-2]).event
+    decoded = velocities.decode_twist_stamped(published[-3])
+    assert (decoded.sensor_frame, decoded.stamp_ns) == ('base_link', ros.STAMP_NS)
+    assert decoded.body_velocity.tolist() == [0.0, 0.0, -0.5, 1.5, 0.0, 0.0]
+    event = clouds.decode_point_cloud2(published[-2])
     assert event.ids.tolist() == [4, -1]
     assert event.points.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]

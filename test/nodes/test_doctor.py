@@ -9,7 +9,7 @@ import pytest
 from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
-from slam_observer_ros.messages.message_types import TRANSFORMS
+from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.nodes.live_inputs import HeardTopic
 from slam_observer_ros.nodes.message_classes import MESSAGES
 

@@ -19,8 +19,8 @@ from tag_drives import past_tags, SETTINGS, STEP_NS
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.estimate_messages import EstimateMessages
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.recording.reader import Recording
@@ -50,7 +50,7 @@ def as_received(event):
     raw = serialize_message(
         MESSAGES.point_cloud2(event.stamp_ns, 'base_link', event.ids, event.points)
     )
-    return decode_point_cloud2(raw).event
+    return decode_point_cloud2(raw)
 
 
 def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
@@ -89,7 +89,7 @@ def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
     for message in odometry:
         assert message.pose.pose == poses[stamp_ns(message)]
     for message in maps:
-        published = decode_point_cloud2(serialize_message(message)).event
+        published = decode_point_cloud2(serialize_message(message))
         ids, points = known[published.stamp_ns]
         assert_array_equal(published.ids, ids)
         assert_array_equal(published.points, points)
@@ -220,6 +220,6 @@ def test_replay_of_tags_with_orientations_gives_the_same_bits(
     states = replayed(path, settings, inputs)
     assert odometry == list(states.odometry.values())
     assert maps == [states.maps[stamp_ns(each)] for each in maps]
-    assert len(decode_point_cloud2(serialize_message(maps[-1])).event.ids) > 0
+    assert len(decode_point_cloud2(serialize_message(maps[-1])).ids) > 0
     points_alone = replayed(path, replace(settings, use_tag_orientation=False), inputs)
     assert odometry[-1] != points_alone.odometry[end_ns], 'orientations were not used'

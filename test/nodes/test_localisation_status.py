@@ -138,7 +138,7 @@ def test_sensors_without_any_noise_are_no_fault():
 
 def test_few_innovations_say_nothing():
     assert innovations(3.0, count=20).factor is None
-    assert innovations(3.0, count=20).problem == ''
+    assert innovations(3.0, count=20).findings == []
 
 
 @pytest.mark.ros

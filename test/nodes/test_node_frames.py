@@ -23,8 +23,8 @@ from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2
-from slam_observer_ros.messages.poses_and_velocities import pose_matrices
+from slam_observer_ros.messages.clouds import decode_point_cloud2
+from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.intake.transforms import LiveTransforms
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
 from slam_observer_ros.simulation import Scenario, Simulation
@@ -66,7 +66,7 @@ def run(ros, robot, on_pose=None):
 
 
 def landmarks(maps):
-    event = decode_point_cloud2(serialize_message(maps[-1])).event
+    event = decode_point_cloud2(serialize_message(maps[-1]))
     return event.points[np.argsort(event.ids)]
 
 
@@ -124,7 +124,7 @@ def test_sensors_on_tf_and_odometry_of_others_give_map_to_odom(ros, tmp_path):
 
 
 def known_ids(maps):
-    return decode_point_cloud2(serialize_message(maps[-1])).event.ids if maps else []
+    return decode_point_cloud2(serialize_message(maps[-1])).ids if maps else []
 
 
 def test_sensor_pose_by_parameter_and_map_to_base_inverted(ros, tmp_path):

@@ -31,16 +31,15 @@ from sensor_msgs.msg import Imu, PointCloud2
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.message_types import IMU, ODOMETRY
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2
-from slam_observer_ros.messages.poses_and_velocities import decode_twist
+from slam_observer_ros.messages.clouds import decode_point_cloud2
+from slam_observer_ros.messages.velocities import decode_twist, ODOMETRY
 from slam_observer_ros.nodes.intake import warning_decoders
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
+IMU = 'sensor_msgs/msg/Imu'
 pytestmark = pytest.mark.ros
 
 SECOND = 1_000_000_000
@@ -129,7 +128,7 @@ def test_a_message_that_had_to_wait_was_received_when_the_middleware_had_it(
     receive(TWIST, {'received_timestamp': waited_since_ns})
     receive(TWIST, {'received_timestamp': 0})  # as where the middleware does not say
     (first, first_ns), (last, last_ns) = received
-    assert (first.event.stamp_ns, last.event.stamp_ns) == (first_ns, last_ns)
+    assert (first.stamp_ns, last.stamp_ns) == (first_ns, last_ns)
     assert last_ns == NOW_NS + 10 * SECOND
     assert first_ns == (last_ns if is_simulated else waited_since_ns)
 
@@ -196,7 +195,7 @@ def test_points_whose_ids_are_named_otherwise_are_reported_once(message_type, na
         ]
     decode = warning_decoders.CloudDecoder(node, message_type)
     decoded = [decode(ros_messages.serialise(cloud), 0) for cloud in clouds]
-    assert [len(message.event.ids) for message in decoded] == [0, 2, 2]
+    assert [len(message.ids) for message in decoded] == [0, 2, 2]
     logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
     start = f"points on '/robot/landmarks' come without ids; {found}: they are distinguished"
     assert [text.startswith(start) for text in logged] == ([] if found is None else [True])
@@ -214,7 +213,7 @@ def test_an_odometry_with_poses_alone_is_reported_once(velocity, speed, is_logge
     decode = warning_decoders.OdometryDecoder(node)
     for step in range(20):
         message = odometry(round(speed * step * SECOND), 0, velocity)
-        assert_allclose(decode(serialize_message(message), 0).event.body_velocity, velocity)
+        assert_allclose(decode(serialize_message(message), 0).body_velocity, velocity)
     logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
     assert len(logged) == is_logged
     assert all("all velocities on '/robot/twist' are zero" in text for text in logged)
@@ -288,8 +287,7 @@ def test_detections_are_found_on_the_topic_and_read(type_name, monkeypatch):
     receive = node.create_subscription.call_args.args[2]
     receive(ros_messages.serialise(DETECTIONS[type_name]), {'received_timestamp': 0})
     (measured, _), _ = feed.add_observation.call_args
-    ids = measured.ids if isinstance(measured, TagDetections) else measured.event.ids
-    assert_array_equal(ids, [7])
+    assert_array_equal(measured.ids, [7])
 
 
 def test_no_package_of_a_detector_is_imported_unasked(monkeypatch):
@@ -314,7 +312,7 @@ def test_an_odometry_without_an_attitude_has_a_velocity():
     message = odometry(0, 0, np.zeros(6))
     message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
     decode = warning_decoders.OdometryDecoder(Mock())
-    assert_allclose(decode(serialize_message(message), 0).event.body_velocity, 0.0)
+    assert_allclose(decode(serialize_message(message), 0).body_velocity, 0.0)
 
 
 def test_a_velocity_without_poses_has_no_pose_differences():
@@ -424,7 +422,7 @@ def test_the_map_has_the_velocities_that_landmarks_came_with(ros, tmp_path):
         ros.spin_until(
             lambda: stamp_ns(maps[-1]) >= start_ns + 15 * STEP_NS, 'a map of the last stamps'
         )
-    event = decode_point_cloud2(serialize_message(maps[-1])).event
+    event = decode_point_cloud2(serialize_message(maps[-1]))
     assert_allclose(event.velocities, speed, atol=1e-6)
     elapsed_s = (stamp_ns(maps[-1]) - start_ns) * 1e-9
     assert_allclose(event.points, points + speed * elapsed_s, atol=1e-3)
@@ -433,7 +431,7 @@ def test_the_map_has_the_velocities_that_landmarks_came_with(ros, tmp_path):
 def seen(maps):
     if not maps:
         return {}
-    event = decode_point_cloud2(serialize_message(maps[-1])).event
+    event = decode_point_cloud2(serialize_message(maps[-1]))
     return dict(zip(event.ids.tolist(), event.points, strict=True))
 
 

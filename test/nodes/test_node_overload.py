@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -13,8 +14,6 @@ from robots import own_topics, Robot, stamp_ns, TransformSender
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.nodes.intake.load import LoadShedding, Waiting
 from slam_observer_ros.nodes.message_classes import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -31,7 +30,7 @@ DEFAULT = {'landmarks_max_wait': ObserverNodeSettings.landmarks_max_wait}
 
 
 def seen_by(frame_id):
-    return Measurement(frame_id, ObservationEvent(0, np.array([1]), np.ones((1, 3))))
+    return ObservationEvent(0, np.array([1]), np.ones((1, 3)), sensor_frame=frame_id)
 
 
 def waiting(*messages, oldest_s, step_s=0.02):
@@ -61,7 +60,7 @@ def test_messages_that_came_at_once_are_all_used():
 
 
 def test_fiducials_of_several_cameras_and_transforms_without_any_are_distinguished():
-    tags = TagDetections(0, 'front', (1,), ('36h11',))
+    tags = replace(seen_by('front'), families=('36h11',))
     messages = waiting([seen_by('left'), seen_by('front')], [], tags, oldest_s=0.2)
     shedding = LoadShedding(0.05)
     assert shedding.newest(messages, NOW_NS, 0.0) == messages

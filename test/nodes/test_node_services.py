@@ -26,10 +26,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher, MANY_UNUSED
+from slam_observer_ros.runs.health import of_calibration
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros
@@ -67,7 +68,7 @@ def values_of(status):
 
 
 def ids(maps):
-    return sorted(decode_point_cloud2(serialize_message(maps[-1])).event.ids) if maps else []
+    return sorted(decode_point_cloud2(serialize_message(maps[-1])).ids) if maps else []
 
 
 def test_paused_observer_holds_its_pose_and_counts_what_it_drops(ros, tmp_path):
@@ -351,7 +352,11 @@ def test_a_calibration_that_nobody_can_mean_is_reported():
     wrong = CalibrationEstimate('angular_scale_z', -0.5, 0.01, '', nominal=1.0, stated=0.03)
     status = Publishing(calibration=[wrong]).publish(observation=1)
     assert status.level == DiagnosticStatus.WARN
-    assert status.message == wrong.problem
+    (finding,) = of_calibration([wrong])
+    assert (status.message, values_of(status)[f'to do: {finding.what}']) == (
+        finding.what,
+        finding.remedy,
+    )
 
 
 def test_points_rejected_long_ago_are_reported_no_more():

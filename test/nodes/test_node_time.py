@@ -27,9 +27,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -59,7 +57,7 @@ def play(ros, robots, clock, deliveries):
 
 
 def landmark_count(maps):
-    return len(decode_point_cloud2(serialize_message(maps[-1])).event.ids) if maps else 0
+    return len(decode_point_cloud2(serialize_message(maps[-1])).ids) if maps else 0
 
 
 def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
@@ -263,11 +261,13 @@ class AnotherClock:
         for child, pose in (('turret', se3.exp(angle * TURN)), ('tag_9', np.eye(4))):
             parent = 'base_link' if child == 'turret' else 'turret'
             self.transforms.insert(parent, child, stamp_ns, pose)
-        self.feed.add('twist', Measurement('', VelocityEvent(stamp_ns, STILL)), received_ns)
+        self.feed.add('twist', VelocityEvent(stamp_ns, STILL), received_ns)
         seen = se3.transform(se3.exp(-angle * TURN), np.array([[3.0, 1.0, 0.0]]))
-        event = ObservationEvent(stamp_ns, np.array([4]), seen)
-        self.feed.add_observation(Measurement('turret', event), received_ns)
-        tags = TagDetections(stamp_ns, 'turret', (9,), ('none',))
+        event = ObservationEvent(stamp_ns, np.array([4]), seen, sensor_frame='turret')
+        self.feed.add_observation(event, received_ns)
+        tags = replace(
+            event, ids=np.array([9]), points=np.full((1, 3), np.nan), families=('none',)
+        )
         self.feed.add('landmarks', tags, received_ns + 1)
 
     def send_all(self):
@@ -323,8 +323,9 @@ def test_of_several_cameras_the_one_whose_clock_is_ahead_is_named():
     for step in range(40):
         received_ns = 1000 * SECOND + step * SECOND // 20
         robot.send(received_ns)
-        event = ObservationEvent(received_ns + 2 * SECOND // 5, np.array([5]), np.ones((1, 3)))
-        robot.feed.add_observation(Measurement('base_link', event), received_ns)
+        stamp_ns, points = received_ns + 2 * SECOND // 5, np.ones((1, 3))
+        event = ObservationEvent(stamp_ns, np.array([5]), points, sensor_frame='base_link')
+        robot.feed.add_observation(event, received_ns)
     said = "stamps on '/landmarks' in frame 'base_link' are 0.400 s ahead of this machine's clock"
     (problem,) = robot.feed.clock_problems()
     assert problem.startswith(said)
@@ -338,7 +339,7 @@ def test_one_stamp_of_the_future_is_named_while_it_is_recent():
     last_ns = robot.send_all()
     assert robot.feed.clock_problems() == []
     event = VelocityEvent(last_ns + SECOND, STILL)
-    robot.feed.add('twist', Measurement('', event), last_ns + SECOND // 10)
+    robot.feed.add('twist', event, last_ns + SECOND // 10)
     (problem,) = robot.feed.clock_problems()
     assert problem.startswith("a stamp on '/twist' was 0.900 s ahead of this machine's clock")
     for step in range(20):
@@ -419,7 +420,7 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
             lambda: all(m and stamp_ns(m[-1]) == end_ns for m in maps.values()), 'the end'
         )
     outcome = {
-        name.strip('/'): decode_point_cloud2(serialize_message(messages[-1])).event
+        name.strip('/'): decode_point_cloud2(serialize_message(messages[-1]))
         for name, messages in maps.items()
     }
     assert_array_equal(outcome['ordered'].ids, outcome['shuffled'].ids)

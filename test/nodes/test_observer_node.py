@@ -30,7 +30,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
 from slam_observer_ros.nodes.publishing.pose_broadcaster import DISCOVERY_S
 from slam_observer_ros.simulation import Scenario
@@ -188,7 +188,7 @@ def test_late_subscriber_gets_the_latched_map(ros, observer):
         ros.spin_for(0.6)
         maps = ros.collect(PointCloud2, 'landmark_map', LATCHED_QOS)
         ros.spin_until(lambda: maps, 'the latched map')
-    assert sorted(decode_point_cloud2(serialize_message(maps[-1])).event.ids) == [0, 1, 2, 3]
+    assert sorted(decode_point_cloud2(serialize_message(maps[-1])).ids) == [0, 1, 2, 3]
 
 
 def test_late_subscriber_of_the_pose_gets_it_as_from_amcl(ros, observer):
@@ -420,9 +420,7 @@ def test_large_ids_are_warned_about(ros, observer):
 
         ros.spin_until(is_warned, 'the warning')
         ros.spin_until(
-            lambda: (
-                maps and large_id in decode_point_cloud2(serialize_message(maps[-1])).event.ids
-            ),
+            lambda: maps and large_id in decode_point_cloud2(serialize_message(maps[-1])).ids,
             'the landmark',
         )
 

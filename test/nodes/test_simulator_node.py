@@ -13,8 +13,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.messages.point_clouds import decode_point_cloud, decode_point_cloud2
-from slam_observer_ros.messages.poses_and_velocities import decode_pose_stamped
+from slam_observer_ros.messages.clouds import decode_point_cloud, decode_point_cloud2
+from slam_observer_ros.messages.poses import decode_pose_stamped
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS
 
 pytestmark = pytest.mark.ros
@@ -50,11 +50,11 @@ def test_messages_are_those_of_the_paper_and_the_node_ends_by_itself(ros, tmp_pa
     assert {twist.twist.angular.z for twist in twists} == {0.2}
     assert {twist.header.frame_id for twist in twists} == {'base_link'}
     assert {truth.header.frame_id for truth in truths} == {'world'}
-    truth = decode_point_cloud2(serialize_message(true_landmarks[-1])).event
+    truth = decode_point_cloud2(serialize_message(true_landmarks[-1]))
     assert_allclose(truth.points, PAPER_LANDMARKS)
     for pose_message, cloud in list(zip(truths, clouds, strict=True))[1:]:
         pose = decode_pose_stamped(serialize_message(pose_message)).pose
-        seen = decode_point_cloud2(serialize_message(cloud)).event
+        seen = decode_point_cloud2(serialize_message(cloud))
         assert seen.stamp_ns == stamp_ns(pose_message)
         assert_allclose(se3.transform(pose, seen.points), PAPER_LANDMARKS, atol=1e-5)
     times_s = [message.clock.sec + message.clock.nanosec * 1e-9 for message in clocks]
@@ -69,7 +69,7 @@ def test_plain_types_in_real_time_need_no_clock(ros, tmp_path):
         ros.spin_until(lambda: len(twists) > 5 and len(clouds) > 5, 'messages')
         clocks = ros.node.get_publishers_info_by_topic('/clock')
         assert '/b' not in {sender.node_namespace for sender in clocks}
-    event = decode_point_cloud(serialize_message(clouds[-1])).event
+    event = decode_point_cloud(serialize_message(clouds[-1]))
     assert event.ids.tolist() == [0, 1, 2, 3]
     now_ns = ros.node.get_clock().now().nanoseconds
     assert 0 <= now_ns - event.stamp_ns < 60e9

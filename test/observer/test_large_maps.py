@@ -8,11 +8,22 @@ from dataclasses import replace
 from hypothesis import given
 import numpy as np
 import pytest
-from random_runs import covariance_of_all, observe, PLAIN, propagate, random_covariances
+from random_runs import (
+    covariance_of_all,
+    observe,
+    PLAIN,
+    propagate,
+    random_covariances,
+    residuals_of,
+)
 from strategies import generators
 
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.residuals import SeenPoints
+from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CHECK_INTERVAL,
@@ -27,6 +38,15 @@ CALIBRATED = replace(
     PLAIN, angular_bias_stddev=(0.02, 0.02, 0.02), linear_scale_stddev=(0.1, 0.1, 0.1)
 )
 PLANAR = replace(CALIBRATED, two_d_mode=True)
+TAGS = replace(CALIBRATED, use_tag_orientation=True)
+PLANAR_TAGS = replace(TAGS, two_d_mode=True)
+
+
+@pytest.fixture(autouse=True)
+def _many_panels(monkeypatch):
+    """So that a change has come to some of them only, most of the time."""
+    for module in (panel_matrix, outside_landmarks):
+        monkeypatch.setattr(module, 'PANEL_ROWS', 12)
 
 
 class Compressed(RiccatiFilter):
@@ -45,7 +65,7 @@ class SameReferences(RiccatiFilter):
         self.compressed = compressed
 
     def propagate(self, motion):
-        super(RiccatiFilter, self).propagate(motion)
+        Filter.propagate(self, motion)
         joint = self.compressed.joint
         points = self.compressed.points if joint.is_dense else joint.references
         self.joint.propagate(motion, points, self.observer.u)
@@ -65,7 +85,9 @@ class World:
         angles = 2.0 * np.pi * np.arange(landmarks) / landmarks
         self.points = radius_m * np.stack([np.sin(angles), 1 - np.cos(angles), 0 * angles], axis=1)
         self.points += self.flat(rng.uniform(-2.0, 2.0, self.points.shape))
-        self.pose, self.ids = np.eye(4), []
+        self.pose, self.ids, self.are_tags = np.eye(4), [], settings.use_tag_orientation
+        turns = rng.normal(size=(landmarks, 3)) * [not self.planar, not self.planar, 1]
+        self.orientations = so3.exp(turns)
         self.radius_m = radius_m
 
     def flat(self, vectors):
@@ -92,13 +114,30 @@ class World:
         new = np.setdiff1d(near, known)
         y, y_new = self.seen(known), self.seen(new)
         R = 0.05**2 * np.tile(np.eye(3), (len(near), 1, 1))
+        rows = np.array([self.ids.index(i) for i in known], dtype=np.int64)
+        rows_new = len(self.ids) + np.arange(len(new))
+        turns, turns_new = self.seen_turns(rows, known), self.seen_turns(rows_new, new)
         for filter_ in filters:
             if len(known):
-                rows = np.array([self.ids.index(i) for i in known])
+                if self.are_tags:
+                    filter_.expected_points(rows)
+                    residuals_of(filter_, rows, y, R[: len(known)])  # makes them active
+                    filter_.correct_by_orientations(turns)
                 observe(filter_, rows, y, R[: len(known)])
             if len(new):
-                filter_.add(y_new, R[: len(new)])
+                filter_.add(SeenPoints(y_new, R[: len(new)]))
+                if self.are_tags:
+                    filter_.add_orientations(turns_new)
         self.ids += new.tolist()
+
+    def seen_turns(self, rows, ids):
+        """How tags are seen to be turned."""
+        noise = 0.1 * self.rng.standard_normal((len(ids), 3))
+        if self.planar:
+            noise[:, :2] = 0.0
+        Z = self.pose[:3, :3].T @ self.orientations[ids] @ so3.exp(noise)
+        R = np.tile(0.01 * np.eye(3), (len(ids), 1, 1))
+        return SeenOrientations(rows, Z, Z, R, np.full(len(ids), 0.1))
 
     def remove(self, filters, rows):
         for filter_ in filters:
@@ -108,7 +147,7 @@ class World:
     def relocate(self, filters, rows):
         y = self.seen(np.array(self.ids)[rows])
         for filter_ in filters:
-            filter_.relocate(rows, y, 0.01 * np.eye(3)[None])
+            filter_.relocate(rows, SeenPoints(y, 0.01 * np.eye(3)[None]))
 
     def drive(self, filters, steps):
         for _ in range(steps):
@@ -117,6 +156,15 @@ class World:
 
 
 def assert_same(compressed, dense, tolerance=1e-9):
+    rows = np.arange(len(dense.points))
+    if dense.estimates_orientations:
+        B, sigmas = dense.orientations.B, dense.orientation_sigmas(rows)
+        np.testing.assert_allclose(compressed.orientation_matrices(rows), B, atol=tolerance)
+        np.testing.assert_allclose(compressed.orientation_sigmas(rows), sigmas, atol=tolerance)
+        of_all = [
+            each.joint.of_landmarks(rows, dense.points, rows) for each in (compressed, dense)
+        ]
+        np.testing.assert_allclose(*of_all, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(compressed.observer.A, dense.observer.A, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(compressed.points, dense.points, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(
@@ -130,7 +178,11 @@ def assert_same(compressed, dense, tolerance=1e-9):
     )
 
 
-@pytest.mark.parametrize('settings', [PLAIN, CALIBRATED, PLANAR], ids=['3D', '3D, c̃', 'planar'])
+@pytest.mark.parametrize(
+    'settings',
+    [PLAIN, CALIBRATED, PLANAR, TAGS, PLANAR_TAGS],
+    ids=['3D', '3D, c̃', 'planar', 'tags', 'planar tags'],
+)
 @given(generators())
 def test_compressed_covariance_is_the_dense_one(settings, rng):
     """Over a loop and its closing, landmarks removed and relocated."""
@@ -160,15 +212,20 @@ def test_copies_share_what_is_large_and_change_apart(rng):
     assert_same(*filters)
 
 
-@pytest.mark.parametrize('settings', [CALIBRATED, PLANAR], ids=['3D', 'planar'])
+@pytest.mark.parametrize(
+    'settings',
+    [CALIBRATED, PLANAR, TAGS, PLANAR_TAGS],
+    ids=['3D', 'planar', 'tags', 'planar tags'],
+)
 @given(generators())
 def test_known_maps_poses_that_are_set_and_known_landmarks_that_anchor(settings, rng):
     filters, world = pair(settings), World(rng, settings)
     ids = rng.permutation(len(world.points))[:15]
     covariances = 0.01 * random_covariances(rng, len(ids), 3)
     known = world.points[ids] + world.flat(0.1 * rng.standard_normal((len(ids), 3)))
+    tags = {'orientations': world.orientations[ids], 'sigmas': np.full(len(ids), 0.05)}
     for filter_ in filters:
-        filter_.add_known(KnownLandmarks(known, covariances))
+        filter_.add_known(KnownLandmarks(known, covariances, **tags if world.are_tags else {}))
     world.ids += ids.tolist()
     world.drive(filters, 30)
     assert_same(*filters)
@@ -200,22 +257,30 @@ def test_references_follow_estimates_that_are_corrected_by_more_than_a_tolerance
         assert since <= CHECK_INTERVAL
 
 
-def test_most_of_what_is_pending_is_folded_a_little_at_a_time():
+def test_what_is_pending_comes_to_the_panels_a_little_at_a_time():
+    """Products of low rank begin, and each panel is given its rows at some later time."""
     rng, matrix, M = np.random.default_rng(0), PanelMatrix(), np.zeros((0, 0))
-    for _number in range(40):
-        grown = np.zeros((len(M) + 3,) * 2)
-        grown[:-3, :-3] = M
-        matrix.extend(len(grown))
-        columns = np.sort(rng.permutation(len(grown))[:5])
-        values = rng.standard_normal((len(grown), len(columns)))
-        values[columns] += values[columns].T
-        grown[:, columns], grown[columns] = values, values.T
-        padded = np.zeros((len(matrix), len(columns)))
-        padded[: len(grown)] = values
-        matrix.set_columns(columns, padded)
-        U, w = rng.standard_normal((len(grown), 9)), rng.choice([-1.0, 1.0], 9)
-        matrix.add(U, w)
-        M = grown + (U * w) @ U.T
-        matrix.fold(1.0)
-        everything = matrix.columns(np.arange(len(M)))[: len(M)]
-        np.testing.assert_allclose(everything, M, atol=1e-9)
+    rows = panel_matrix.PANEL_ROWS
+    for number in range(40):
+        if number < 5:
+            matrix.append()
+            M = np.pad(M, (0, rows))
+        for panel in range(len(matrix)):
+            columns = np.sort(rng.permutation(len(M))[:5])
+            values = rng.standard_normal((rows, 5))
+            own = slice(rows * panel, rows * (panel + 1))
+            inside = (columns >= own.start) & (columns < own.stop)
+            square = values[columns[inside] - own.start][:, inside]
+            values[np.ix_(columns[inside] - own.start, np.flatnonzero(inside))] = square + square.T
+            matrix.set_columns(panel, columns, values)
+            M[own, columns], M[columns, own] = values, values.T
+        U, w = rng.standard_normal((len(M), 9)), rng.choice([-1.0, 1.0], 9)
+        matrix.begin(w)
+        for panel in rng.permutation(len(matrix)):
+            matrix.add(panel, U[rows * panel : rows * (panel + 1)])
+            matrix.fold(1.0)
+        matrix.end()
+        M = M + (U * w) @ U.T
+        everything = np.arange(len(M))
+        found = [matrix.columns(panel, everything) for panel in range(len(matrix))]
+        np.testing.assert_allclose(np.concatenate(found), M, atol=1e-9)

@@ -105,7 +105,7 @@ def test_far_from_the_others_is_judged_by_what_these_predict(rng, spread, scale,
         )
         left = (r[i] - expected_r)[None]
         expected[i] = mahalanobis(left, noise[[i]])[0] > 3.0 * 6.0
-    found = far_from_the_others(r, predicted, noise, Settings(rejection_threshold=6.0))
+    found = far_from_the_others(r, predicted, noise, 6.0)
     np.testing.assert_array_equal(found, expected)
 
 

@@ -34,14 +34,15 @@ def sources():
 def test_folders_show_the_architecture(structure):
     assert len(structure.loose_modules()) <= 5
     assert structure.layers() <= 12
-    assert len(structure.longest_chain()) <= 19  # one is the flow of data, in a file of its own
+    assert len(structure.longest_chain()) <= 20  # of calibrate, which judges as tune does
 
 
 def test_a_step_with_ids_takes_no_more_calls_than_it_did(structure):
     step = structure.traced_step()
-    assert len(step.modules) <= 37  # one of them is the columns of all tables
-    assert step.changes <= 140  # 7 of them find out how noisy the motion is
-    assert step.depth <= 14
+    # Of the reference in numpy; with the compiled core it is half as many.
+    assert len(step.modules) <= 29
+    assert step.changes <= 91
+    assert step.depth <= 11
 
 
 def test_docstrings_are_a_fifth_of_all_lines_at_most(structure):

@@ -18,7 +18,7 @@ from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.ellipses import ellipses
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
-from slam_observer_ros.report.findings import growth_windows
+from slam_observer_ros.runs.error_health import growth_windows
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 MEGABYTE = 1_000_000
@@ -60,6 +60,25 @@ def test_what_gains_do_not_know_is_left_out(slam_observer, tmp_path, gains):
     recording, report = write_mcap(tmp_path / 'run.mcap'), tmp_path / 'run.html'
     slam_observer.succeed('replay', recording, '--gains', gains, '--report', report)
     assert 'nis' not in numbers_of(report)['consistency']
+
+
+def test_what_is_estimated_of_a_sensor_begins_where_it_is_heard(slam_observer, tmp_path):
+    recording, report = tmp_path / 'run.mcap', tmp_path / 'run.html'
+    with RecordingWriter(recording) as writer:
+        for number, event in enumerate(events()):
+            if number > MESSAGE_COUNT or not isinstance(event, ObservationEvent):
+                writer.write_event(event)
+    settings = ('linear_bias_stddev=[0.01,0,0]', 'sensor_rotation_stddev=[0,0,0.1]')
+    options = [word for setting in settings for word in ('--set', setting)]
+    slam_observer.succeed('replay', recording, *options, '--report', report)
+    numbers = numbers_of(report)
+    begins = {}
+    for part in numbers['calibration']:
+        assert len(part['t']) == len(part['value']) == len(part['deviation'])
+        assert part['t'][-1] == numbers['errors']['t'][-1]
+        begins[part['name'].partition('/')[0]] = part['t'][0]
+    assert begins['linear_bias_x'] == numbers['errors']['t'][0]
+    assert begins['sensor_rotation_z'] > begins['linear_bias_x']
 
 
 def test_settings_that_differ_are_listed(slam_observer, tmp_path):
@@ -265,7 +284,7 @@ def test_a_report_begins_with_that_nothing_was_used(slam_observer, tmp_path):
                 event = replace(event, ids=event.ids, points=np.full_like(event.points, np.nan))
             writer.write_event(event)
     assert slam_observer('replay', recording, '--report', report).code == 0
-    sentence = 'No observation was used: the trajectory is that of the velocities alone.'
-    assert numbers_of(report)['findings'][0]['text'] == sentence
+    sentence = 'No observation was used (dropped: 50 without a point that is used'
+    assert numbers_of(report)['findings'][0]['text'].startswith(sentence)
     shown = open_page(report).html
     assert shown.index(sentence) < shown.index('id="time-bar"')

@@ -5,19 +5,22 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 import logging
 import os
 from pathlib import Path
 
 from slam_observer_ros.cli.batch.index import INDEX, SCORES, write_index
 from slam_observer_ros.cli.batch.jobs import (
-    asked_at,
     find_recordings,
     grid_points,
     Job,
     make_job,
     part_of,
+    REPORTS,
     shard_of,
+    TRAJECTORIES,
+    Work,
 )
 from slam_observer_ros.cli.batch.pool import cluster_pool, local_pool, Pool
 from slam_observer_ros.cli.batch.run_log import (
@@ -27,7 +30,6 @@ from slam_observer_ros.cli.batch.run_log import (
     read_logs,
     write_failures,
 )
-from slam_observer_ros.cli.batch.worker import REPORTS, TRAJECTORIES, Work
 from slam_observer_ros.cli.console import (
     muted_warnings,
     print_json,
@@ -35,12 +37,12 @@ from slam_observer_ros.cli.console import (
     show_message,
     show_runs,
 )
-from slam_observer_ros.cli.options import add_settings_options, named, named_path
+from slam_observer_ros.cli.options import add_settings_options, named, named_path, read_given
 from slam_observer_ros.cli.outputs import check_directory
-from slam_observer_ros.cli.replay.asked import add_run_options, read_asked
-from slam_observer_ros.cli.replay.identity import sha256_of
+from slam_observer_ros.cli.replay.request import add_run_options, read_request
+from slam_observer_ros.cli.replay.summary import sha256_of
 from slam_observer_ros.common.errors import IncompleteError, OutputError
-from slam_observer_ros.common.output_files import destination
+from slam_observer_ros.common.files import destination
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)
@@ -113,14 +115,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Do the runs that are not done yet, and write the index of all."""
     recordings, points = find_recordings(args.recordings), grid_points(args.grid)
-    asked = asked_at(args, read_asked(args), points)
+    request = read_request(args, read_given(args), recordings[0])
+    requests = [request.with_values(point) for point in points]
     pool = _pool(args, len(recordings) * len(points))
     _make_folders(args)
     with opened_log(args.out / log_name('runs', args.shard)) as log:
         done_before = read_logs(args.out)
         hashes, failures = _hashes(args, recordings, len(points))
         jobs = [
-            make_job(args, recording, hashes[recording], points[number], asked[number])
+            make_job(
+                replace(requests[number], recording=recording), hashes[recording], points[number]
+            )
             for recording, part in _parts(args, recordings, len(points))
             if recording in hashes
             for number in part
@@ -129,7 +134,7 @@ def run(args: argparse.Namespace) -> None:
             job for job in jobs if not _is_done(args, done_before.get(job.run_id))
         )
         try:
-            ended_runs = pool.run(Work(args, args.out.absolute()), left)
+            ended_runs = pool.run(Work(args.out.absolute(), args.reports, args.trajectories), left)
             for ended in show_runs(ended_runs, 'running', len(left)):
                 if ended.result is not None:
                     log.append(ended.result)

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import glob
 import hashlib
 import itertools
 import json
 from pathlib import Path
 import re
-from typing import Any
 
+from slam_observer_ros.cli.console import kept_warnings
 from slam_observer_ros.cli.options import parse_value
-from slam_observer_ros.cli.replay.asked import Asked, check_smooth
-from slam_observer_ros.cli.replay.input_options import topic_names
+from slam_observer_ros.cli.replay.files import write_report_of
+from slam_observer_ros.cli.replay.request import Records, ReplayRequest
+from slam_observer_ros.cli.replay.run import replayed
+from slam_observer_ros.cli.replay.summary import as_json, identity, summary_rows
 from slam_observer_ros.common.errors import shown, UsageError
-from slam_observer_ros.common.input_files import not_special
+from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.evaluation.trajectory import write_tum
 from slam_observer_ros.known_map.map_file import map_files
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names, suggestion, table, Value
 
-_OF_ESTIMATOR = {row.name: row for row in table(Settings)}
-_OF_INPUTS = {row.name: row for row in table(InputSettings)}
-_KNOWN = _OF_INPUTS | _OF_ESTIMATOR
+_KNOWN = {row.name: row for row in (*table(InputSettings), *table(Settings))}
 
 _ID_DIGITS = 16
 
@@ -40,10 +41,14 @@ class Job:
     """A run that is to be done; ``run_id`` is a hash of all that its figures depend on."""
 
     run_id: str
-    recording: Path
     recording_sha256: str
     point: Point
-    asked: Asked
+    request: ReplayRequest
+
+    @property
+    def recording(self) -> Path:
+        """The recording that is replayed."""
+        return self.request.recording
 
     @property
     def file_stem(self) -> str:
@@ -108,43 +113,21 @@ def part_of(recordings: Sequence[Path], points: int, shard: tuple[int, int]) -> 
     return [range(max(first - at, 0), min(max(last - at, 0), points)) for at in starts]
 
 
-def with_values(asked: Asked, point: Mapping[str, Value]) -> Asked:
-    """Return what is asked for with other values of some parameters."""
-    settings: dict[str, Any] = {}
-    inputs: dict[str, Any] = {}
-    for name, value in point.items():
-        (settings if name in _OF_ESTIMATOR else inputs)[name] = value
-    return Asked(
-        dataclasses.replace(asked.settings, **settings),
-        dataclasses.replace(asked.inputs, **inputs).with_plain_frames(),
-    )
-
-
-def asked_at(args: argparse.Namespace, asked: Asked, points: Iterable[Point]) -> list[Asked]:
-    """Return what is asked for at each point; raise a SlamObserverError if it can't be run."""
-    found = [with_values(asked, point) for point in points]
-    for one in found:
-        check_smooth(args, one.settings)
-    return found
-
-
-def make_job(
-    args: argparse.Namespace, recording: Path, sha256: str, point: Point, asked: Asked
-) -> Job:
-    """Return the job of one recording at one point."""
-    maps = [] if args.load_map is None else map_files(args.load_map)
+def make_job(request: ReplayRequest, sha256: str, point: Point) -> Job:
+    """Return the job of one recording at one point, whose values the request has."""
+    maps = [] if request.load_map is None else map_files(request.load_map)
     map_bytes = b''.join(not_special(path).read_bytes() for path in maps)
     depends_on = {
         'recording': sha256,
         'version': VERSION,
-        'settings': _changed(asked.settings),
-        'inputs': _changed(asked.inputs),
-        'topics': dataclasses.astuple(topic_names(args)),
+        'settings': _changed(request.settings),
+        'inputs': _changed(request.inputs),
+        'topics': dataclasses.astuple(request.topics),
         'map': _sha256_of_bytes(map_bytes) if maps else None,
-        'smooth': args.smooth,
+        'smooth': request.smooth,
     }
     run_id = _sha256_of_bytes(json.dumps(depends_on, sort_keys=True).encode())[:_ID_DIGITS]
-    return Job(run_id, recording, sha256, point, asked)
+    return Job(run_id, sha256, point, request)
 
 
 def _changed(settings: Settings | InputSettings) -> dict[str, object]:
@@ -153,3 +136,46 @@ def _changed(settings: Settings | InputSettings) -> dict[str, object]:
 
 def _sha256_of_bytes(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
+
+
+REPORTS, TRAJECTORIES = 'reports', 'trajectories'
+"""Folders of ``--out`` for files of the runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Does the jobs of a batch, and writes those files of each that are asked for."""
+
+    out: Path
+    writes_reports: bool
+    writes_trajectories: bool
+    version: str = VERSION
+
+    def __call__(self, job: Job) -> dict[str, object]:
+        """Do a run, write its files, and return its line of the log."""
+        if self.version != VERSION:
+            raise UsageError(f'this worker has version {VERSION}, the batch {self.version}')
+        report = self._file(REPORTS, job, '.html') if self.writes_reports else None
+        tum = self._file(TRAJECTORIES, job, '.tum') if self.writes_trajectories else None
+        records = Records(poses=tum is not None, whole_run=report is not None)
+        with kept_warnings() as warnings:
+            outcome, _ = replayed(replace(job.request, records=records), shows_progress=False)
+        outcome = replace(outcome, warnings=warnings)
+        if tum is not None:
+            write_tum(outcome.trajectory, tum)
+        if report is not None:
+            write_report_of(job.file_stem, outcome, summary_rows(outcome), report)
+        return {
+            'run': job.run_id,
+            'grid': job.point,
+            'report': self._relative(report),
+            'trajectory': self._relative(tum),
+            **identity(job.recording, job.recording_sha256, outcome),
+            **as_json(outcome),
+        }
+
+    def _file(self, folder: str, job: Job, suffix: str) -> Path:
+        return self.out / folder / f'{job.file_stem}{suffix}'
+
+    def _relative(self, file: Path | None) -> str | None:
+        return None if file is None else file.relative_to(self.out).as_posix()

@@ -6,16 +6,24 @@ import argparse
 from dataclasses import replace
 
 from slam_observer_ros.cli.console import kept_warnings, print_json
-from slam_observer_ros.cli.options import add_settings_options, named_path
-from slam_observer_ros.cli.outputs import add_force_option, add_result_options
-from slam_observer_ros.cli.replay.asked import add_run_options, read_asked
-from slam_observer_ros.cli.replay.estimate_recording import add_recording_options
-from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
-from slam_observer_ros.cli.replay.identity import identity, sha256_of
+from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
+from slam_observer_ros.cli.outputs import add_force_option
+from slam_observer_ros.cli.replay.files import (
+    add_output_options,
+    check_files,
+    records_of,
+    write_files,
+)
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.cli.replay.rerun import add_rerun_option
+from slam_observer_ros.cli.replay.request import add_run_options, read_request, warn_of_unused
 from slam_observer_ros.cli.replay.run import replayed
-from slam_observer_ros.cli.replay.summary import as_json, print_summary, summary_rows
+from slam_observer_ros.cli.replay.summary import (
+    as_json,
+    identity,
+    print_summary,
+    sha256_of,
+    summary_rows,
+)
 from slam_observer_ros.common.errors import LossError, OutputError
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -33,24 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='.mcap, .db3 or ROS 1 .bag file, or rosbag2 directory',
     )
     add_run_options(parser)
-    outputs = parser.add_argument_group('outputs')
-    outputs.add_argument(
-        '--tum',
-        type=named_path,
-        metavar='FILE',
-        help='trajectory, as evo reads it, at most 20 poses a second',
-    )
-    outputs.add_argument('--map', type=named_path, metavar='FILE', help='landmarks, as YAML')
-    outputs.add_argument(
-        '--report',
-        type=named_path,
-        metavar='OUT.html',
-        help='one page for any browser, without a network: map, residuals, consistency and '
-        'calibration over time',
-    )
-    add_recording_options(outputs)
-    add_rerun_option(outputs)
-    add_result_options(outputs, FIGURES)
+    add_output_options(parser)
     parser.add_argument(
         '--strict',
         action='store_true',
@@ -65,9 +56,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Replay a recording, and write what was asked for."""
     with kept_warnings() as warnings:
-        asked = read_asked(args)
-        check_files(args)
-        outcome, map_frame = replayed(args, asked)
+        given = read_given(args)
+        request = read_request(args, given, args.recording)
+        check_files(args, given.file)
+        warn_of_unused(args, given)
+        outcome, map_frame = replayed(replace(request, records=records_of(args)))
     _write_and_print(args, replace(outcome, warnings=warnings), map_frame)
 
 
@@ -83,5 +76,5 @@ def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame
         raise OutputError('; '.join(errors))
     if args.strict and any(outcome.lost.values()):
         raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')
-    if args.strict and outcome.nothing_used:
-        raise LossError(f'{args.recording}: --strict does not allow this: {outcome.nothing_used}')
+    if args.strict and outcome.unused_input:
+        raise LossError(f'{args.recording}: --strict does not allow this: {outcome.unused_input}')

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import logging
+import math
+from pathlib import Path
 
-from slam_observer_ros.cli.replay.dropped import MALFORMED, unused_messages
 from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.findings import Finding, found, Level
 from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.recording.reader import Recording
@@ -23,8 +26,22 @@ from slam_observer_ros.runs.accuracy import (
     smoothed_trajectory,
     SmoothedAccuracy,
 )
+from slam_observer_ros.runs.error_health import of_errors
+from slam_observer_ros.runs.health import (
+    of_calibration,
+    of_fit,
+    of_left_out,
+    of_map,
+    of_mounting,
+    of_noise,
+    of_ranges,
+    of_rejections,
+)
+from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
 from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import Replay
+from slam_observer_ros.runs.reported_run import ReportedRun
+from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)
 
@@ -34,7 +51,9 @@ class ReplayOutcome:
     """A replay, and all that is reported of it.
 
     ``unused`` counts the messages that did not become events, by reason; ``missing_ids`` is what
-    :meth:`.Contents.missing_ids` says of the landmarks. What is smoothed is None if not asked for.
+    :meth:`.Contents.missing_ids` says of the landmarks. What is smoothed, and the ``whole_run``
+    that is shown, are None if not asked for. ``findings`` are what is wrong, the worst first, and
+    ``warnings`` all that was logged.
     """
 
     selected: SelectedTopics
@@ -49,6 +68,8 @@ class ReplayOutcome:
     smoothed_trajectory: Trajectory | None = None
     smoothed_accuracy: SmoothedAccuracy | None = None
     recorder: RunRecorder | NisTally | None = None
+    whole_run: ReportedRun | None = None
+    findings: Sequence[Finding] = ()
     warnings: Sequence[str] = ()
 
     @property
@@ -62,15 +83,10 @@ class ReplayOutcome:
         return dict(self.result.estimator.dropped + self.unused)
 
     @property
-    def nothing_used(self) -> str:
+    def unused_input(self) -> str:
         """Which kind of input was of no use at all, as a sentence; '' if something of each was."""
-        has_velocities = self.result.estimator.counts['velocity'] > 0
-        if self.result.observations:
-            consequence = 'the landmarks alone move the robot'
-            return '' if has_velocities else f'No velocity was used: {consequence}.'
-        if has_velocities:
-            return 'No observation was used: the trajectory is that of the velocities alone.'
-        return 'Nothing was used, neither a velocity nor an observation.'
+        kinds = ('nothing_used', 'no_observation', 'no_velocity')
+        return next((each.text() for each in self.findings if each.kind in kinds), '')
 
     @property
     def lost(self) -> dict[str, int | float | bool]:
@@ -117,7 +133,11 @@ class ReplayOutcome:
 
 
 def outcome_of(
-    recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
+    recording: Recording,
+    selected: SelectedTopics,
+    result: Replay,
+    truth: Truth,
+    recorder: RunRecorder | NisTally | None,
 ) -> ReplayOutcome:
     """Measure a replay of a recording that has been read to its end."""
     estimator = result.estimator
@@ -129,6 +149,20 @@ def outcome_of(
         result.configuration,
         truth,
     )
+    whole_run = None
+    if isinstance(recorder, RunRecorder):
+        whole_run = ReportedRun(
+            settings=estimator.settings,
+            start_ns=result.start_ns,
+            trajectory=result.trajectory,
+            dead_reckoning=result.dead_reckoning,
+            in_known_map=result.in_known_map,
+            truth=truth,
+            errors=accuracy.pose_errors,
+            anees=accuracy.anees,
+            instants=recorder.finish(estimator),
+            innovations=recorder.innovations,
+        )
     return ReplayOutcome(
         selected,
         result,
@@ -138,7 +172,60 @@ def outcome_of(
         unused_messages(recording, selected),
         recording.contents.missing_ids(selected.landmarks),
         recording.loss,
+        recorder=recorder,
+        whole_run=whole_run,
     )
+
+
+def judged(
+    outcome: ReplayOutcome,
+    recording: Recording,
+    inputs: InputSettings,
+    use: Sequence[Finding],
+    map_path: Path | None,
+) -> ReplayOutcome:
+    """Add what is wrong, and log what gives reason to warn; ``use`` is what was of none."""
+    result, selected = outcome.result, outcome.selected
+    findings = [
+        *use,
+        *_of_lost_pose(result, map_path),
+        *of_recording(recording, selected, inputs, result),
+        *_of_estimate(outcome),
+        *of_timing(recording, selected),
+        *(of_errors(outcome.whole_run) if outcome.whole_run is not None else ()),
+    ]
+    findings.sort(key=lambda finding: -finding.level)
+    for finding in findings:
+        if finding.level >= Level.WARNING:
+            logger.warning('%s', finding.text())
+    return replace(outcome, findings=findings)
+
+
+def _of_lost_pose(result: Replay, map_path: Path | None) -> list[Finding]:
+    if result.estimator.is_localised or result.localised_ns is None:
+        return []
+    end_s = result.seconds_until(result.localised_ns[1])
+    return [found('lost_pose', path=map_path, seconds=end_s)]
+
+
+def _of_estimate(outcome: ReplayOutcome) -> Iterator[Finding]:
+    """Judge the estimate as /diagnostics does, over the whole run."""
+    result = outcome.result
+    estimator, counts = result.estimator, result.estimator.counts
+    yield from of_rejections(counts)
+    yield from of_calibration(estimator.calibration)
+    yield from of_mounting(estimator.calibration)
+    yield from of_ranges(result.range_power, estimator.settings.range_is_depth)
+    yield from of_noise(estimator.motion_factors)
+    nis = None if outcome.recorder is None else outcome.recorder.mean_nis
+    yield from of_fit(None if nis is None else math.sqrt(nis))
+    if result.in_known_map and estimator.settings.localization_mode != 'off':
+        yield from of_map(counts, is_start_given=estimator.settings.set_initial_pose)
+    # These were logged when they happened.
+    yield from of_left_out(counts, Level.NOTE)
+    for name in UNEXPECTED_POSES:
+        if counts[name]:
+            yield replace(found(name), level=Level.NOTE)
 
 
 def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
@@ -159,7 +246,7 @@ def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
         smoothed,
         stamps_ns,
         outcome.result.dead_reckoning,
-        outcome.result.estimator.calibration,
+        outcome.result.estimator,
     )
     return replace(
         outcome,

@@ -5,21 +5,50 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
+import hashlib
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.figures import ACCURACY_ROWS, figure_text
-from slam_observer_ros.cli.replay.dropped import list_dropped
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
+from slam_observer_ros.common.files import not_special
+from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
+from slam_observer_ros.recording.opening import files_of
+from slam_observer_ros.runs.input_health import list_dropped
 from slam_observer_ros.runs.replay import Replay
+from slam_observer_ros.settings.parameter_table import changed_names
+
+_BLOCK_BYTES = 1 << 20
 
 NEARLY_ALL = 0.99
 """Share of the trajectory that the truth covers, up to which it is printed."""
 
 LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported', 'doubled')
 """What may happen to landmarks of the map; counted under these names."""
+
+
+def identity(recording: Path, sha256: str, outcome: ReplayOutcome) -> dict[str, object]:
+    """Return what was replayed, by what, as ``--json`` has it first."""
+    settings = outcome.result.estimator.settings
+    return {
+        'recording': str(recording),
+        'recording_sha256': sha256,
+        'version': VERSION,
+        'settings': {name: getattr(settings, name) for name in changed_names(settings)},
+        'warnings': list(outcome.warnings),
+    }
+
+
+def sha256_of(recording: Path) -> str:
+    """Return the SHA-256 of a recording's files, one after the other, as hexadecimal digits."""
+    digest = hashlib.sha256()
+    for file in files_of(recording):
+        with not_special(file).open('rb') as opened:
+            while block := opened.read(_BLOCK_BYTES):
+                digest.update(block)
+    return digest.hexdigest()
 
 
 def as_json(outcome: ReplayOutcome) -> dict[str, object]:
@@ -38,6 +67,7 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'landmarks': len(estimator.landmark_ids),
         'dropped': outcome.dropped,
         'lost': outcome.lost,
+        'findings': [finding.as_json() for finding in outcome.findings],
         'used': dict(estimator.counts),
         'calibration': {part.name: asdict(part) for part in estimator.calibration},
         'motion_factors': {part.name: asdict(part) for part in estimator.motion_factors},
@@ -76,7 +106,7 @@ def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
     selected = outcome.selected
     estimator = outcome.result.estimator
     note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
-    rows = {'used': outcome.nothing_used} if outcome.nothing_used else {}
+    rows = {'used': outcome.unused_input} if outcome.unused_input else {}
     rows |= {
         'velocity topic': str(selected.velocity),
         'landmarks topic': f'{selected.landmarks}{note}',

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 
 from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
-from slam_observer_ros.cli.options import (
-    add_settings_options,
-    named_path,
-    read_assignments,
-    read_config,
-)
+from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
 from slam_observer_ros.cli.outputs import (
     add_force_option,
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay.asked import Asked, read_asked
-from slam_observer_ros.cli.replay.input_options import add_input_options
+from slam_observer_ros.cli.replay.request import add_input_options, read_request, ReplayRequest
 from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
 from slam_observer_ros.cli.tune.noise_kinds import kinds_of, NoiseKind, scaled
-from slam_observer_ros.cli.tune.search import Found, most_likely, remembered, without_effect
+from slam_observer_ros.cli.tune.search import Found, search_noise
 from slam_observer_ros.cli.tune.tuned_file import certainty, rounded, verdict_lines, write_tuned
 from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
 from slam_observer_ros.common.errors import IncompleteError, UsageError
@@ -64,54 +59,42 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Tune on some recordings, and judge on what was held out."""
-    asked = read_asked(args)
-    if not DESIGNS[asked.settings.gains].has_joint_covariance:
-        raise UsageError(f'tune needs riccati gains, not {asked.settings.gains}')
+    given = read_given(args)
+    request = read_request(args, given, args.recordings[0])
+    settings = request.settings
+    if not DESIGNS[settings.gains].has_joint_covariance:
+        raise UsageError(f'tune needs riccati gains, not {settings.gains}')
     recordings = [*args.recordings, *args.hold_out]
     read = {f'the recording {path}': files_of(path) for path in recordings}
     check_inputs_are_kept({'--out': args.out}, read)
     check_outputs([args.out], args.force)
     with muted_warnings():  # they are shown when it is judged; here, before the long search
-        hashes = [read_material(args, path, asked, 1.0).sha256 for path in args.hold_out]
+        hashes = [
+            read_material(replace(request, recording=path), 1.0).sha256 for path in args.hold_out
+        ]
     share = 0.0 if args.hold_out else HELD_OUT_SHARE
-    trained_on = [read_material(args, path, asked, share) for path in args.recordings]
+    trained_on = [
+        read_material(replace(request, recording=path), share) for path in args.recordings
+    ]
     hashes += [material.sha256 for material in trained_on]
     if len(set(hashes)) < len(hashes):
         raise UsageError('a recording is given twice; what is trained on can not be held out, too')
-    kinds, found = _search(trained_on, asked.settings)
-    tuned = _rounded(scaled(asked.settings, kinds, found.log_factors.tolist()), kinds)
-    verdict = _verdict(args, asked, trained_on, tuned)
-    _print(args, asked.settings, tuned, kinds, found, verdict)
+    # What the settings that are tried give reason to warn of is nobody's concern.
+    with muted_warnings(), shown_steps('tuning') as advance:
+        likelihoods = [material.likelihood for material in trained_on]
+        kinds, found = search_noise(likelihoods, settings, kinds_of(settings), advance)
+    if not kinds:
+        raise UsageError('no noise figure has an effect: messages state all covariances')
+    tuned = _rounded(scaled(settings, kinds, found.log_factors.tolist()), kinds)
+    verdict = _verdict(request, args.hold_out, trained_on, tuned)
+    _print(args, settings, tuned, kinds, found, verdict)
     if verdict.objection:
         raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
     if args.out is not None:
-        given = read_config(args) | read_assignments(args)
         texts = [(kind, text) for kind, text in zip(kinds, _certainties(found), strict=True)]
         held_out = [str(path) for path in args.hold_out] or ['the last third of each']
         trained = [f'{one.path.name} (SHA-256 {one.sha256})' for one in trained_on]
-        write_tuned(args.out, given, tuned, texts, trained, held_out, verdict)
-
-
-def _search(trained_on: Sequence[Material], settings: Settings) -> tuple[list[NoiseKind], Found]:
-    """Return the kinds of noise that have an effect, and their most likely factors."""
-    # What the settings that are tried give reason to warn of is nobody's concern.
-    with muted_warnings(), shown_steps('tuning') as advance:
-
-        def log_likelihood(kinds: list[NoiseKind], log_factors: Sequence[float]) -> float:
-            advance()
-            tried = scaled(settings, kinds, log_factors)
-            likelihoods = [material.likelihood(tried) for material in trained_on]
-            return sum(one.mean * count for one, count in zip(likelihoods, counts, strict=True))
-
-        counts = [material.likelihood(settings).count for material in trained_on]
-        if not all(counts):
-            raise UsageError('nothing is seen twice in what is trained on')
-        kinds = kinds_of(settings)
-        idle = without_effect(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
-        kinds = [kind for number, kind in enumerate(kinds) if number not in idle]
-        if not kinds:
-            raise UsageError('no noise figure has an effect: messages state all covariances')
-        return kinds, most_likely(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
+        write_tuned(args.out, given.values, tuned, texts, trained, held_out, verdict)
 
 
 def _rounded(settings: Settings, kinds: Sequence[NoiseKind]) -> Settings:
@@ -121,18 +104,21 @@ def _rounded(settings: Settings, kinds: Sequence[NoiseKind]) -> Settings:
 
 
 def _verdict(
-    args: argparse.Namespace, asked: Asked, trained_on: Sequence[Material], tuned: Settings
+    request: ReplayRequest,
+    held_out: Sequence[Path],
+    trained_on: Sequence[Material],
+    tuned: Settings,
 ) -> Verdict:
     """Compare the settings on what was held out, one recording after the other."""
     before: list[Judged] = []
     after: list[Judged] = []
-    for number in range(len(args.hold_out) or len(trained_on)):
+    for number in range(len(held_out) or len(trained_on)):
         material = (
-            read_material(args, args.hold_out[number], asked, 1.0)
-            if args.hold_out
+            read_material(replace(request, recording=held_out[number]), 1.0)
+            if held_out
             else trained_on[number]
         )
-        before.append(material.judged(asked.settings))
+        before.append(material.judged(request.settings))
         after.append(material.judged(tuned))
     if not all(len(judged.likelihood.stamps_ns) for judged in (*before, *after)):
         raise UsageError('nothing is seen twice in what is held out')

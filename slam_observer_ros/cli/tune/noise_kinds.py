@@ -47,8 +47,22 @@ _OF_POINTS = {
 
 def kinds_of(settings: Settings) -> list[NoiseKind]:
     """Return the kinds of error that settings state, each with its figures that are not zero."""
+    return [*of_motion(settings), *of_points(settings)]
+
+
+def of_motion(settings: Settings) -> list[NoiseKind]:
+    """Return those of velocities."""
+    return _stated(_OF_MOTION, settings)
+
+
+def of_points(settings: Settings) -> list[NoiseKind]:
+    """Return those of points."""
+    return _stated(_OF_POINTS[settings.observation_model], settings)
+
+
+def _stated(possible: Sequence[NoiseKind], settings: Settings) -> list[NoiseKind]:
     kinds = []
-    for kind in (*_OF_MOTION, *_OF_POINTS[settings.observation_model]):
+    for kind in possible:
         stated = tuple(name for name in kind.parameters if np.any(getattr(settings, name)))
         if stated:
             kinds.append(NoiseKind(kind.name, stated))

@@ -9,10 +9,10 @@ from pathlib import Path
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind
 from slam_observer_ros.cli.tune.verdict import Verdict
 from slam_observer_ros.common.errors import OutputError
-from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.version import VERSION
-from slam_observer_ros.settings.dump import value_text
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_file import value_text
 from slam_observer_ros.settings.parameter_table import Value
 
 DIGITS = 3
@@ -63,24 +63,47 @@ def write_tuned(
     verdict: Verdict,
 ) -> None:
     """Write what was given, and what was tuned in its place; an OutputError if that fails."""
-    names = [name for kind, _ in tuned for name in kind.parameters]
-    lines = [
-        f'# Noise by slam-observer tune {VERSION}: maximum likelihood of the innovations of',
-        *(f'#   {name}' for name in trained_on),
-        '# held out:',
-        *(f'#   {name}' for name in held_out),
-        *(f'#   {name}: {text}' for name, text in verdict_lines(verdict).items()),
-        '# Intervals are of 95 %, by the curvature of the likelihood, as if all innovations were',
-        '# independent: errors that last make them too narrow.',
-        '/**:',
-        '  ros__parameters:',
+    head = [
+        f'Noise by slam-observer tune {VERSION}: maximum likelihood of the innovations of',
+        *(f'  {name}' for name in trained_on),
+        *judged_lines(held_out, verdict),
+        'Intervals are of 95 %, by the curvature of the likelihood, as if all innovations were',
+        'independent: errors that last make them too narrow.',
     ]
+    found = [
+        (
+            f'{kind.name}: {text} what it was',
+            {name: rounded(getattr(settings, name)) for name in kind.parameters},
+        )
+        for kind, text in tuned
+    ]
+    write_found(path, head, given, found)
+
+
+def judged_lines(held_out: Sequence[str], verdict: Verdict) -> list[str]:
+    """Return what the head of a file says of what was held out."""
+    return [
+        'held out:',
+        *(f'  {name}' for name in held_out),
+        *(f'  {name}: {text}' for name, text in verdict_lines(verdict).items()),
+    ]
+
+
+def write_found(
+    path: Path,
+    head: Sequence[str],
+    given: Mapping[str, object],
+    found: Sequence[tuple[str, Mapping[str, object]]],
+) -> None:
+    """Write parameters as given but for those found, which have a comment for each group."""
+    names = {name for _, values in found for name in values}
+    lines = [*(f'# {line}' for line in head), '/**:', '  ros__parameters:']
     others = {name: value for name, value in given.items() if name not in names}
     if others:
         lines += ['    # As it was given', *(_entry(name, others[name]) for name in others)]
-    for kind, text in tuned:
-        lines += ['', f'    # {kind.name}: {text} what it was']
-        lines += [_entry(name, rounded(getattr(settings, name))) for name in kind.parameters]
+    for comment, values in found:
+        lines += ['', *(f'    # {line}' for line in comment.splitlines())]
+        lines += [_entry(name, value) for name, value in values.items()]
     try:
         with unfinished_file(path) as file:
             file.write('\n'.join(lines) + '\n')

@@ -20,8 +20,8 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.messages.cdr import CdrReader
-from slam_observer_ros.messages.point_clouds import decode_point_cloud, decode_point_cloud2
-from slam_observer_ros.messages.poses_and_velocities import (
+from slam_observer_ros.messages.clouds import decode_point_cloud, decode_point_cloud2
+from slam_observer_ros.messages.poses import (
     decode_pose_stamped,
     decode_pose_with_covariance_stamped,
 )
@@ -159,7 +159,7 @@ class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
         self.lyapunov.append(float(CdrReader(raw).float64(1)[0]))
 
     def _read_estimates(self, raw: bytes) -> None:
-        event = decode_point_cloud(raw).event
+        event = decode_point_cloud(raw)
         self._estimates[event.stamp_ns] = dict(zip(event.ids.tolist(), event.points, strict=True))
 
     def _read_true_pose(self, raw: bytes) -> None:
@@ -168,5 +168,5 @@ class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._true_poses.append(message.pose)
 
     def _read_true_landmarks(self, raw: bytes) -> None:
-        event = decode_point_cloud2(raw).event
+        event = decode_point_cloud2(raw)
         self._true_landmarks = dict(zip(event.ids.tolist(), event.points, strict=True))

@@ -17,7 +17,7 @@ from tf2_msgs.msg import TFMessage
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import UNKNOWN_ID
-from slam_observer_ros.messages.poses_and_velocities import pose_matrices
+from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.nodes.message_classes import MESSAGES
 

@@ -26,9 +26,7 @@ from slam_observer_ros.inputs.event_builder import (
     with_receive_time,
 )
 from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.point_clouds import scan_problem
+from slam_observer_ros.messages.clouds import scan_problem
 from slam_observer_ros.nodes.guarded_node import described
 from slam_observer_ros.nodes.intake.clocks import ClockChange, ClockOffset
 from slam_observer_ros.nodes.logs import ThrottledLog
@@ -157,19 +155,15 @@ class EstimatorFeed:
             self._log.warning(reason, f'{reason}: the time of reception is taken instead')
         self._give(self._builder.add(timed, time.monotonic_ns()), name)
 
-    def add_observation(
-        self, measured: Measurement[ObservationEvent] | TagDetections, receive_ns: int
-    ) -> None:
+    def add_observation(self, measured: ObservationEvent, receive_ns: int) -> None:
         """Take landmarks, unless they are a lidar's scan."""
-        problem = scan_problem(measured.event) if isinstance(measured, Measurement) else ''
+        problem = scan_problem(measured)
         if self.is_active and problem:
             self._drop('scan', problem)
         else:
             self.add('landmarks', measured, receive_ns)
 
-    def add_observations(
-        self, measured: Sequence[Measurement[ObservationEvent]], receive_ns: int
-    ) -> None:
+    def add_observations(self, measured: Sequence[ObservationEvent], receive_ns: int) -> None:
         """Take landmarks of several cameras."""
         for each in measured:
             self.add_observation(each, receive_ns)
@@ -259,7 +253,7 @@ class EstimatorFeed:
 
     def _check_clock(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Compare a stamp with this machine's clock, and report if that is another one."""
-        sensor = name, measured.frame_id
+        sensor = name, measured.sensor_frame
         if sensor not in self._sensor_clocks:
             if len(self._sensor_clocks) >= MAX_SENSORS:
                 return

@@ -69,7 +69,7 @@ class Waiting:
     def sensors(self) -> set[str]:
         """Frames of the sensors whose measurements it has."""
         parts = self.message if isinstance(self.message, Sequence) else [self.message]
-        return {part.frame_id for part in parts}
+        return {part.sensor_frame for part in parts}
 
 
 class LoadShedding:

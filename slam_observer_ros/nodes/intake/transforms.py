@@ -13,7 +13,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import insert_transforms
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
-from slam_observer_ros.messages.poses_and_velocities import decode_transforms
+from slam_observer_ros.messages.poses import decode_transforms
 from slam_observer_ros.nodes.intake.input_topic import take
 from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import TFMessage

@@ -13,20 +13,16 @@ from slam_observer_ros.inputs.odometry_check import OdometryCheck
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.message_types import CLOUD_DECODERS
-from slam_observer_ros.messages.poses_and_velocities import (
-    decode_odometry,
-    decode_transforms,
-    PoseMessage,
-)
+from slam_observer_ros.messages.poses import decode_transforms, PoseMessage
+from slam_observer_ros.messages.registry import Decode, decoders
+from slam_observer_ros.messages.velocities import decode_odometry
 
 MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero
 WITHOUT_TAG_S = 20.0  # time without any fiducial on /tf after which their names may be others
 
 
 class CloudDecoder:
-    """Decodes clouds of a type in ``CLOUD_DECODERS``; warns once if their points have no ids.
+    """Decodes clouds of a type; warns once if their points have no ids.
 
     These are then distinguished by their positions, as is wanted, or as a name is misspelt.
     """
@@ -34,16 +30,16 @@ class CloudDecoder:
     def __init__(self, node: Node, message_type: str) -> None:
         self._node = node
         self._message_type = message_type
+        self._decode: Decode[ObservationEvent] = decoders('landmarks')[message_type]
         self._is_checked = False
 
-    def __call__(self, raw: Buffer, receive_ns: int) -> Measurement[ObservationEvent]:
+    def __call__(self, raw: Buffer, receive_ns: int) -> ObservationEvent:
         """Decode a cloud."""
-        message = CLOUD_DECODERS[self._message_type](raw, receive_ns)
-        ids = message.event.ids
-        if not self._is_checked and len(ids) and (ids == UNKNOWN_ID).all():
+        event = self._decode(raw, receive_ns)
+        if not self._is_checked and len(event.ids) and (event.ids == UNKNOWN_ID).all():
             self._is_checked = True
             self._check(raw)
-        return message
+        return event
 
     def _check(self, raw: Buffer) -> None:
         names = read_fields(raw, self._message_type).names
@@ -74,16 +70,16 @@ class OdometryDecoder:
         self.problem = ''
         self._first: FloatArray | None = None
 
-    def __call__(self, raw: Buffer, receive_ns: int) -> Measurement[VelocityEvent]:
+    def __call__(self, raw: Buffer, receive_ns: int) -> VelocityEvent:
         """Decode the velocity of a nav_msgs/Odometry."""
-        pose, message = decode_odometry(raw)
+        pose, velocity = decode_odometry(raw)
         if not self._gives_velocities:
-            self._look_for_velocities(pose, message.event)
+            self._look_for_velocities(pose, velocity)
         elif not self._check.is_decided:
-            self._check.add(pose, message.event)
+            self._check.add(pose, velocity)
             if self._check.problem:
                 self._warn(f"the twist on '{self._topic}' {self._check.problem}")
-        return message
+        return velocity
 
     def _look_for_velocities(self, pose: PoseMessage, event: VelocityEvent) -> None:
         # One that has given a velocity will do so again.
@@ -112,7 +108,7 @@ class TagDecoder:
         self._is_checked = False
         self._frames: set[str] = set()
 
-    def __call__(self, raw: Buffer, _receive_ns: int) -> list[Measurement[ObservationEvent]]:
+    def __call__(self, raw: Buffer, _receive_ns: int) -> list[ObservationEvent]:
         """Decode what of a tf2_msgs/TFMessage are sightings of fiducials."""
         transforms = decode_transforms(raw)
         seen = observed_tags(transforms, self._prefix)

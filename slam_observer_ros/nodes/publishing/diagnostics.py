@@ -9,12 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from slam_observer_ros.estimates import (
-    MAX_REJECTED,
-    MAX_REJECTED_ORIENTATIONS,
-    point_share,
-    UNUSED_POINTS,
-)
+from slam_observer_ros.common.findings import Finding, found, Level
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.nodes.guarded_node import GuardedNode
@@ -22,7 +17,12 @@ from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus
-from slam_observer_ros.runs.health import estimator_values, estimator_warnings
+from slam_observer_ros.runs.health import (
+    estimator_values,
+    of_estimate,
+    of_left_out,
+    of_rejections,
+)
 
 SILENT_S = 2.0  # an input without messages for this long is a warning
 RECENT = 30  # statuses, of about a second each, over which rejected points are counted
@@ -32,16 +32,6 @@ MANY_UNUSED = 20  # messages, none of which was used, that are no transient of t
 
 USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
 """Inputs, and what their messages are counted as when they are used."""
-
-LEFT_OUT = (
-    'rejected_landmark',
-    'unknown_id',
-    'repeated_id',
-    'reserved_id',
-    'impossible_id',
-    'unweighed_point',
-)
-"""Points not used for something that is wrong; those that are not in a known map may be right."""
 
 
 class DiagnosticsPublisher:
@@ -68,6 +58,7 @@ class DiagnosticsPublisher:
         self._last_time_s = time.monotonic()
         self._seen_s: float | None = None  # when a landmark was seen last
         self._said_empty = False
+        self._since_s: dict[str, float] = {}  # when what is wrong was found first
         self._last_received = {source.topic: 0 for source in inputs}
         self._last_dropped: Counter[str] = Counter()
         self._last_counts: Counter[str] = Counter()
@@ -76,21 +67,23 @@ class DiagnosticsPublisher:
     def publish(self) -> None:
         """Publish the status of the estimate and of the localisation, about once a second."""
         dropped, new = self._progress()
-        # What came while the node was paused or inactive was not to be used.
-        unused = [self._unused_warning(source) for source in self._inputs] if dropped else []
-        unused = [warning for warning in unused if warning]
-        warnings = unused + self._warnings(dropped, new)
+        findings = self._findings(dropped, new)
+        level = max((finding.level for finding in findings), default=Level.NOTE)
         used = new['velocity'] + new['observation']
-        level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
-        none_is_used = bool(dropped) and not used and not self._feed.is_paused
-        if none_is_used or unused:
-            level = DiagnosticStatus.ERROR
-        values = self._input_values() | self._estimator_values()
+        if dropped and not used and not self._feed.is_paused:
+            level = Level.ERROR
+        problems = [finding.what for finding in findings] + self._faults()
+        if problems:
+            level = max(level, Level.WARNING)
+        now_s = time.monotonic()
+        self._since_s = {each.kind: self._since_s.get(each.kind, now_s) for each in findings}
+        values = self._input_values() | self._estimator_values(findings)
+        values |= {f'{kind}, for [s]': f'{now_s - t:.0f}' for kind, t in self._since_s.items()}
         status = DiagnosticStatus(
-            level=level,
+            level=bytes([level]),
             name=f'{self._node.get_fully_qualified_name().lstrip("/")}: estimate',
             hardware_id=self._hardware_id,
-            message='; '.join(warnings) or 'running',
+            message='; '.join(problems) or 'running',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status, self._localisation.status(self._hardware_id)])
@@ -115,8 +108,8 @@ class DiagnosticsPublisher:
             values['odometry on /tf age [s]'] = f'{age_s:.3f}'
         return values
 
-    def _estimator_values(self) -> dict[str, str]:
-        values = estimator_values(self._estimator, self._dropped())
+    def _estimator_values(self, findings: Sequence[Finding]) -> dict[str, str]:
+        values = estimator_values(self._estimator, self._dropped(), findings)
         age_s = 'never' if self._seen_s is None else f'{time.monotonic() - self._seen_s:.0f}'
         values['landmarks seen, age [s]'] = age_s
         values['processing time, mean [ms]'] = f'{self._feed.take_mean_processing_ms():.3f}'
@@ -138,91 +131,64 @@ class DiagnosticsPublisher:
         shed = Counter(overload=sum(source.shedding.shed for source in self._inputs))
         return self._estimator.dropped + self._feed.dropped + shed
 
-    def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
-        warnings = [self._input_warning(source) for source in self._inputs]
-        warnings += self._feed.clock_problems()
-        warnings.append(self._estimate_publisher.early_odometry())
-        warnings.append(self._estimate_publisher.rivals())
+    def _findings(self, dropped: Counter[str], new: Counter[str]) -> list[Finding]:
+        """Judge what came and what is estimated, the inputs of which nothing was used first."""
+        findings = []
+        if dropped:  # what came while the node was paused or inactive was not to be used
+            findings += [found_so for source in self._inputs for found_so in self._of_use(source)]
+        findings += [
+            found('silent_input', topic=source.topic)
+            for source in self._inputs
+            if not source.problem and (source.age_s or 0.0) > SILENT_S
+        ]
         if self._feed.is_paused:
-            warnings.append('paused')
+            findings.append(found('paused'))
         elif dropped:
             (reason, _), *others = dropped.most_common()
+            count = f'{dropped.total()} message{"s" * (dropped.total() != 1)}'
             reasons = f'mostly {reason}' if others else reason
-            plural = 's' * (dropped.total() != 1)
-            warnings.append(f'{dropped.total()} message{plural} dropped ({reasons})')
-        warnings.append(self._empty_warning())
-        warnings.append(self._points_warning(new))
-        warnings += self._rejection_warnings(new)
-        warnings += estimator_warnings(self._estimator)
-        warnings.append(self._estimate_publisher.problem)
-        warnings.append(self._node.last_failure)
+            findings.append(found('dropped_messages', count=count, reasons=reasons))
+        findings += self._of_empty_messages()
+        findings += of_left_out(new, Level.WARNING)
+        self._recent_counts.append(new)
+        recent = sum(self._recent_counts, Counter())
+        if recent['observed_point'] >= MIN_POINTS:
+            findings += of_rejections(recent, 'seen lately ')
+        findings += of_estimate(self._estimator)
         if not self._estimator.is_localised:
-            warnings.append('the pose in the loaded map is not known yet: no pose is published')
-            warnings.append(self._places_warning())
-        return [warning for warning in warnings if warning]
+            findings.append(found('unknown_pose'))
+            # Landmarks that came without an id have one that was given here.
+            if is_automatic(self._estimator.landmark_ids).any():
+                problem = self._estimator.localisation_problem
+                findings.append(found('ambiguous_pose', problem=problem))
+        return findings
 
-    def _unused_warning(self, source: InputTopic[Any]) -> str:
+    def _faults(self) -> list[str]:
+        """Return what inputs, clocks and publishers report of themselves, with what to do."""
+        faults = [source.problem for source in self._inputs]
+        faults += self._feed.clock_problems()
+        faults.append(self._estimate_publisher.early_odometry())
+        faults.append(self._estimate_publisher.rivals())
+        faults.append(self._estimate_publisher.problem)
+        faults.append(self._node.last_failure)
+        return [fault for fault in faults if fault]
+
+    def _of_use(self, source: InputTopic[Any]) -> list[Finding]:
         """Report an input whose messages come, and not one of them was used so far."""
         kind = USED_AS.get(source.name)
         if kind is None or source.received < MANY_UNUSED or self._feed.is_paused:
-            return ''
+            return []
         if self._last_counts[kind]:
-            return ''
-        return f"none of {source.received} messages on '{source.topic}' was used"
+            return []
+        return [found('unused_input', count=source.received, topic=source.topic)]
 
-    def _empty_warning(self) -> str:
+    def _of_empty_messages(self) -> list[Finding]:
         """Report, and log once, that a detector has not seen anything so far."""
         observations = self._last_counts['observation']
         if self._seen_s is not None or observations < MANY_EMPTY:
-            return ''
+            return []
+        finding = found('empty_messages', count=observations)
         if not self._said_empty:
             self._said_empty = True
-            self._node.get_logger().warning(
-                f'no landmark in the first {observations} messages: are there any in view, and is '
-                'the detector set up for them?'
-            )
-        return f'no landmark in {observations} messages so far'
-
-    def _places_warning(self) -> str:
-        """Report where in a map points without ids fit."""
-        # Landmarks that came without an id have one that was given here.
-        if not is_automatic(self._estimator.landmark_ids).any():
-            return ''
-        return f'{self._estimator.localisation_problem} on initialpose'
-
-    def _rejection_warnings(self, new: Counter[str]) -> list[str]:
-        """Report that more points or orientations were rejected of late than are outliers."""
-        self._recent_counts.append(new)
-        recent = sum(self._recent_counts, Counter())
-        if recent['observed_point'] < MIN_POINTS:
-            return []
-        points, orientations = (
-            point_share(recent, f'rejected_{what}') for what in ('landmark', 'orientation')
-        )
-        warnings = []
-        if points > MAX_REJECTED:
-            warnings.append(f'{100.0 * points:.0f} % of the points seen lately were rejected')
-        if orientations > MAX_REJECTED_ORIENTATIONS:
-            warnings.append(
-                f'the orientations of {100.0 * orientations:.0f} % of the tags seen lately were '
-                'rejected: has the map other tag axes than the detector?'
-            )
-        return warnings
-
-    @staticmethod
-    def _points_warning(new: Counter[str]) -> str:
-        """Report points left out since the last time: most of them, or for their ids."""
-        left_out = {name: new[name] for name in LEFT_OUT if new[name]}
-        of_wrong_ids = new['repeated_id'] + new['reserved_id'] + new['impossible_id']
-        if not (of_wrong_ids or 2 * sum(left_out.values()) > new['observed_point']):
-            return ''
-        reasons = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())
-        return f'of {new["observed_point"]} points seen {reasons}'
-
-    @staticmethod
-    def _input_warning(source: InputTopic[Any]) -> str:
-        if source.problem:
-            return source.problem
-        if (source.age_s or 0.0) > SILENT_S:
-            return f"no message on '{source.topic}'"
-        return ''
+            self._node.get_logger().warning(finding.text())
+        return [finding]

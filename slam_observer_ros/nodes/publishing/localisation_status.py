@@ -9,17 +9,18 @@ import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Bool
 
+from slam_observer_ros.common.findings import Finding, Level
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS
+from slam_observer_ros.runs.health import of_fit
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT = 300  # observations over which innovations are compared with the noise that is stated
 MIN_DEGREES = 100  # of freedom, that it takes to say so; the factor is then known to 7 %
 FOUND_AGAIN = 0.8  # of the error level: near it the robot would be lost and found all the time
-TOO_SMALL = 2.0  # times as large as stated: neither chance nor a sensor's usual correlation
 
 
 class NoiseFit:
@@ -43,26 +44,15 @@ class NoiseFit:
         return float(np.sqrt(sum(nis for nis, _ in self._recent) / degrees))
 
     @property
-    def problem(self) -> str:
-        """What is wrong with the noise that is stated; empty if nothing is."""
-        factor = self.factor
-        if factor is None or factor <= TOO_SMALL:
-            return ''
-        return f'the stated noise is too small by a factor of {factor:.1f}'
+    def findings(self) -> list[Finding]:
+        """What is wrong with the noise that is stated."""
+        return of_fit(self.factor)
 
     def __str__(self) -> str:
-        """Return the factor, and what is wrong if it is small."""
-        factor = self.factor
-        if factor is None:
+        """Return the factor, and what is wrong with the noise by it."""
+        if self.factor is None:
             return 'not known yet'
-        # Zero is that of sensors without any noise, as a simulation's may be.
-        is_small = 0.0 < factor < 1.0 / TOO_SMALL
-        hint = (
-            f' (the stated noise is too large by a factor of {1.0 / factor:.1f})'
-            if is_small
-            else ''
-        )
-        return f'{factor:.2f}{hint}'
+        return f'{self.factor:.2f}' + ''.join(f' ({each.what})' for each in self.findings)
 
 
 class LocalisationStatus:
@@ -99,9 +89,10 @@ class LocalisationStatus:
         """Return the status for /diagnostics."""
         deviations = self._deviations()
         level, message = self._judge(deviations)
-        if self._noise.problem:
-            level = max(level, DiagnosticStatus.WARN)
-            message = f'{message}; {self._noise.problem}'
+        for finding in self._noise.findings:
+            if finding.level >= Level.WARNING:
+                level = max(level, DiagnosticStatus.WARN)
+                message = f'{message}; {finding.what}'
         known = ('unknown', 'unknown') if deviations is None else [f'{d:.3f}' for d in deviations]
         values = {
             'map': self._estimator.map_name or 'none',

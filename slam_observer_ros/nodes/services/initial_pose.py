@@ -13,7 +13,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
 from slam_observer_ros.geometry.matrices import are_covariances, limited
-from slam_observer_ros.messages.poses_and_velocities import (
+from slam_observer_ros.messages.poses import (
     decode_pose_with_covariance_stamped,
     PoseMessage,
 )

@@ -1,12 +1,5 @@
-"""The covariance of all errors that the Riccati filter knows of, in right-invariant coordinates.
+"""The covariance P of all errors x that the Riccati filter knows of (:mod:`.chart`).
 
-The errors are x = (ε, c̃, ξ_1 … ξ_n): of the pose, Â = exp(ε) A, of the calibration, and of the
-landmarks, ξ_i = ã_i + [ŷ_i]× ε_Ω with ã_i that of the estimate ŷ_i in the reference frame. The
-p axes of ε and k of a point are those that are estimated. A point that moves with the pose has
-ξ_i = ε_v, so residuals are r_i = ε_v − ξ_i whatever the map is (A. Barrau and
-S. Bonnabel, *The invariant extended Kalman filter as a stable observer*, 2017).
-
-Where the sensor is calibrated as well, r_i = ε_v − ξ_i + R̂ D_i c̃ (:mod:`.sensor_calibration`).
 The blocks C_i of all methods are of ε (m, k, p), or of (ε, c̃), the first entries of x
 (m, k, p + c).
 """
@@ -21,18 +14,17 @@ from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     kalman_update,
     transpose,
     with_blocks,
 )
+from slam_observer_ros.observer.chart import Chart, sheared
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
-from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
 if TYPE_CHECKING:
@@ -48,13 +40,19 @@ class JointCovariance:
     active: IntArray | slice = slice(None)
 
     def __init__(
-        self, axes: EstimatedAxes, calibration: Calibration, matrix: SymmetricMatrix
+        self, chart: Chart, matrix: SymmetricMatrix, start: FloatArray, unknown: FloatArray
     ) -> None:
-        self._axes, self._p, self._matrix = axes, axes.p, matrix
-        self.P = calibration.initial_covariance()
-        self.first = len(self.P)  # p + c, the first column of the landmarks
-        self._stride = axes.point  # columns of each landmark
-        self._first_columns = self.first + np.arange(axes.point)
+        """Begin with ``start``, that of pose and calibration (p + c, p + c).
+
+        ``unknown`` (stride − k,) are the variances of all else of a landmark seen for the first
+        time.
+        """
+        self._axes, self._p, self._matrix = chart.axes, chart.axes.p, matrix
+        self.P, self._unknown = start, unknown
+        self._use(chart)
+
+    def _use(self, chart: Chart) -> None:
+        self.chart, self.first, self._stride = chart, chart.first, chart.stride
 
     @property
     def P(self) -> FloatArray:  # noqa: N802 (the field's name for it)
@@ -90,14 +88,17 @@ class JointCovariance:
         P[np.ix_(at, at)] = before
         new = np.arange(self.first, self.first + count)
         P[new, new] = variances
-        self.first += count
-        self._first_columns = self._first_columns + count
+        self._use(self.chart.with_calibration(count))
         self.P = P
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
         """Return the covariances (n, 3, 3) of ã_i for ``points`` (n, 3), ``ahead_s`` from now."""
-        n, k = len(points), self._axes.point
-        _, own = self.output(self._turning(points), np.arange(n))
+        n, k, joint = len(points), self._axes.point, self
+        if self.chart.velocity:
+            joint = copy(self)
+            joint._matrix = self._matrix.copy()
+            joint._drift_on(n, ahead_s)
+        _, own = joint.output(self._turning(points), np.arange(n))
         covariances = np.zeros((n, 3, 3))
         covariances[:, :k, :k] = own
         return covariances
@@ -111,13 +112,15 @@ class JointCovariance:
     def of_landmarks(
         self, rows: IntArray, points: FloatArray, tags: IntArray
     ) -> FloatArray | None:
-        """Return the covariance (m k + …) of ã_i of ``rows`` (m,), then of how ``tags`` turn."""
-        with_pose = self.with_pose(rows, points)
-        return None if with_pose is None else with_pose[self._p :, self._p :]
-
-    def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        """Return ξ_i (n, 3) of x, and the changes of velocities, None where there are none."""
-        return self._axes.full_points(x[self.first :]), None
+        """Return the covariance (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,)."""
+        with_pose, p = self.with_pose(rows, points), self._p
+        if with_pose is None or not len(tags):
+            return None if with_pose is None else with_pose[p:, p:]
+        of_turns = self._turn_columns(tags)
+        columns = np.concatenate([np.arange(p), self._columns(rows), of_turns])
+        P, L = self.P[np.ix_(columns, columns)], np.zeros((len(columns) - p, p))
+        L[: len(L) - len(of_turns)] = -self._turning(points).reshape(-1, p)
+        return sheared(P, p, L)[p:, p:]
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks (m,), which are going to be observed, are in P."""
@@ -126,16 +129,28 @@ class JointCovariance:
         """Return the same with all landmarks in P."""
         return self
 
-    def postponed_shifts(self, rows: IntArray) -> FloatArray:
-        """Return how far landmarks (m, 3) have yet to be moved, metres."""
-        raise NotImplementedError
+    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
+        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
+        return a
+
+    def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
+        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
+        return B
 
     # The step
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
         """Let the robot move, and landmarks of velocities ``u`` (n, 3), to ``points`` (n, 3)."""
-        # Known velocities change no ξ_i.
-        self._propagate(motion, self._turning(points).reshape(-1, self._p))
+        if self.chart.velocity:
+            self._drift_on(len(points), motion.duration_s)
+        self._propagate(motion, self.chart.all_still(points, u))
+
+    def _drift_on(self, n: int, duration_s: float) -> None:
+        """Let ξ_i of n landmarks grow by ũ_i dt; velocities that are known change none."""
+        P, rows = self.P, np.arange(n)
+        columns, velocities = self._columns(rows), self.chart.velocities(rows)
+        P[columns] += duration_s * P[velocities]
+        P[:, columns] += duration_s * P[:, velocities]
 
     def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
         """Let x become x + J (F c̃ + w), w the noise of a motion, with J's rows of landmarks."""
@@ -157,16 +172,21 @@ class JointCovariance:
         # [0, I] at ŷ_i. Turning ŷ_i to the point seen, by however much, moves it at right angles
         # to the middle between them: judged by C at ŷ_i, a robot that has turned further than it
         # knows would reject what it sees.
-        return self._with_sensor(self._axes.output_matrix(chord * residuals.r), residuals.D)
-
-    def _with_sensor(self, C: FloatArray, D: FloatArray | None) -> FloatArray:
-        """Return C_i (m, k, p + c) of C_i (m, k, p) and R̂ D_i (m, 3, c), if there is one."""
-        return C if D is None else np.concatenate([C, D[:, : self._axes.point]], axis=2)
+        return self.chart.output(chord * residuals.r, residuals.D)
 
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return H P (m k, …) and H P Hᵀ (m k, m k) of H x = C_i (ε, c̃) − ξ_i."""
-        q, columns = C.shape[2], self._columns(rows)
-        C = C.reshape(-1, q)
+        return self._project(C.reshape(-1, C.shape[2]), self._columns(rows))
+
+    def project_turns(
+        self, rows: IntArray, D: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω − ω_i + D c̃, D (3, c)."""
+        C = np.tile(self.chart.turn_output(D), (len(rows), 1))
+        return self._project(C, self._turn_columns(rows))
+
+    def _project(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+        q = C.shape[1]
         HP = C.dot(self.P[:q]) - self._matrix.rows(columns)
         return HP, HP[:, :q].dot(C.T) - HP.take(columns, axis=1)
 
@@ -219,63 +239,82 @@ class JointCovariance:
 
     def add_seen(self, covariances: FloatArray, D: FloatArray | None = None) -> None:
         """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3), R̂ D_i."""
-        rows, noise = self._make_room(len(covariances)), self._noise(covariances)
-        self._insert(rows, self._with_sensor(self._moving(rows), D), noise)
+        self._insert_seen(self._make_room(len(covariances)), covariances, D)
 
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
         self._insert(self._make_room(len(points)), self._turning(points), self._noise(covariances))
 
     def add_correlated(self, known: KnownLandmarks) -> None:
-        """Append landmarks of a map (m,) likewise, but with errors that are correlated."""
+        """Append landmarks of a map (m,) whose errors, of turns as well, are correlated."""
         rows, covariance = self._make_room(len(known)), known.covariance_on(self._axes)
         self._insert(rows, self._turning(known.points), covariance)
+        if self.chart.turn:
+            turns, points = self.chart.turns(rows[known.tags]), self._columns(rows)
+            R, q = known.joint_on(self._axes), len(points)
+            self.P[np.ix_(turns, points)], self.P[np.ix_(points, turns)] = R[q:, :q], R[:q, q:]
+            self.P[np.ix_(turns, turns)] = R[q:, q:]
 
     def relocate(
         self, rows: IntArray, covariances: FloatArray, D: FloatArray | None = None
     ) -> None:
         """Take landmarks (m,) for newly seen ones, with covariances (m, 3, 3), R̂ D_i."""
-        C = self._with_sensor(self._moving(covariances), D)
-        self._insert(rows, C, self._noise(covariances))
+        self._insert_seen(rows, covariances, D)
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
-        columns = (self.first + self._stride * rows[:, None] + np.arange(self._stride)).ravel()
+        columns = self.chart.of_landmarks(rows)
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
 
-    def gauge(self, n: int) -> FloatArray:
-        """Return G (…, p): how x changes when all, with n landmarks, is moved by exp(γ)."""
-        rows = np.arange(n)
-        G = np.zeros((len(self.P), self._p))
-        G[: self._p] = np.eye(self._p)
-        G[self._columns(rows)] = self._moving(rows).reshape(-1, self._p)
-        return G
+    # Orientations
 
-    def at_rest(self, rows: IntArray, points: FloatArray) -> FloatArray:
-        """Return G (…, p) likewise if landmarks ``rows`` at ``points`` (m, 3) are not moved."""
-        G = np.zeros((len(self.P), self._p))
-        G[self._columns(rows)] = self._turning(points).reshape(-1, self._p)
-        return G
+    def project_own_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of ω_i."""
+        columns = self._turn_columns(rows)
+        HP = self.P[columns]
+        return HP, HP[:, columns]
 
-    def difference(
-        self, rows: IntArray, others: IntArray, points: FloatArray, other_points: FloatArray
-    ) -> FloatArray:
-        """Return H (m k, …) of the differences ã_i − ã_j of landmarks at two points (m, 3)."""
-        H = np.zeros((len(rows) * self._axes.point, len(self.P)))
-        each = np.arange(len(H))
-        H[each, self._columns(rows)], H[each, self._columns(others)] = 1.0, -1.0
-        H[:, : self._p] = self._turning(other_points - points).reshape(-1, self._p)
-        return H
+    def own_turns(self, rows: IntArray) -> FloatArray:
+        """Return the covariances (m, q, q) of each ω_i, rad²."""
+        columns = self._turn_columns(rows).reshape(len(rows), self.chart.turn)
+        covariances: FloatArray = self.P[columns[:, :, None], columns[:, None, :]]
+        return covariances
+
+    def project_turn_differences(
+        self, rows: IntArray, others: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of ω_i − ω_j."""
+        own, other = self.chart.turns(rows), self.chart.turns(others)
+        HP = self.P[own] - self.P[other]
+        return HP, HP[:, own] - HP[:, other]
+
+    def add_turns(
+        self, rows: IntArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
+        """Take over orientations (m,) seen for the first time: ω_i = φ_i + noise (m, q, q)."""
+        C = np.tile(self.chart.turn_output(D), (len(rows), 1))
+        self._set(self._turn_columns(rows), C, block_diagonal(covariances))
+
+    def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
+        """Take over orientations (m,) whose errors (m, q, q) are independent of all else."""
+        columns = self._turn_columns(rows)
+        self._set(columns, np.zeros((len(columns), self._p)), block_diagonal(covariances))
+
+    def copy_turns(self, source: IntArray, target: IntArray) -> None:
+        """Let tags ``target`` (m,) have the orientations, with their errors, of others."""
+        source, target = self.chart.turns(source), self.chart.turns(target)
+        self.P[target] = self.P[source]
+        self.P[:, target] = self.P[:, source]
 
     # Other coordinates
 
     def of_positions(self, points: FloatArray) -> FloatArray:
         """Return the covariance of (ε, c̃, ã_1 … ã_n) for estimates ``points`` (n, 3)."""
-        return sheared(self.P, self.first, -self._all_turning(points))
+        return self.chart.of_positions(self.P, points)
 
     def set_of_positions(self, covariance: FloatArray, points: FloatArray) -> None:
         """Take over what :meth:`of_positions` returns."""
-        self.P = sheared(covariance, self.first, self._all_turning(points))
+        self.P = self.chart.from_positions(covariance, points)
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
         """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
@@ -289,10 +328,21 @@ class JointCovariance:
         k = self._axes.point
         return block_diagonal(covariances[:, :k, :k])
 
+    def _insert_seen(self, rows: IntArray, covariances: FloatArray, D: FloatArray | None) -> None:
+        C = self.chart.output(np.zeros((len(rows), 3)), D)
+        self._insert(rows, C, self._noise(covariances))
+
     def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
-        # ξ_i = C_i (ε, c̃) + noise of this covariance (m k, m k)
-        q, columns = C.shape[2], self._columns(rows)
-        C = C.reshape(-1, q)
+        # ξ_i = C_i (ε, c̃) + noise of this covariance (m k, m k); of all else nothing is known.
+        self._set(self._columns(rows), C.reshape(-1, C.shape[2]), noise)
+        if len(self._unknown):
+            others = np.append(self._turn_columns(rows), self.chart.velocities(rows))
+            unknown = np.tile(self._unknown, len(rows))
+            self._set(others, np.zeros((len(others), self._p)), np.diag(unknown))
+
+    def _set(self, columns: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        """Let entries of x (r,) be C (ε, c̃) + noise of a covariance (r, r)."""
+        q = C.shape[1]
         CP = C @ self.P[:q]
         self.P[columns], self.P[:, columns] = CP, CP.T
         own = CP[:, :q] @ C.T + noise
@@ -305,88 +355,13 @@ class JointCovariance:
         return np.arange(first_row, first_row + m)
 
     def _columns(self, rows: IntArray) -> IntArray:
-        return (self._first_columns + self._stride * rows[:, None]).ravel()
+        return self.chart.points(rows)
+
+    def _turn_columns(self, rows: IntArray) -> IntArray:
+        return self.chart.turns(rows)
 
     def _all_turning(self, points: FloatArray) -> FloatArray:
-        return self._turning(points).reshape(-1, self._p)
+        return self.chart.all_still(points)
 
     def _turning(self, points: FloatArray) -> FloatArray:
-        """Return the blocks [[y_i]×, 0] (m, k, p): ξ_i of landmarks without an error ã_i."""
-        return -self._axes.turn_matrix(points)
-
-    def _moving(self, landmarks: FloatArray | IntArray) -> FloatArray:
-        """Return the blocks [0, I] (m, k, p): ξ_i of m landmarks that move with the pose."""
-        return self._axes.output_matrix(np.zeros((len(landmarks), 3)))
-
-
-class ExactMapCovariance(JointCovariance):
-    """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
-
-    active = slice(0)
-
-    def __init__(
-        self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray
-    ) -> None:
-        self._axes, self._p, self.first = axes, axes.p, joint.first
-        self._first_columns, self._matrix = joint._first_columns, joint._matrix
-        self.P = joint.P[: self.first, : self.first]
-        self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
-
-    def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
-        """Return the covariances (n, 3, 3) of the landmarks, as the map has them."""
-        return self._covariances
-
-    def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray | None:
-        """Return None: how far the map is off, nobody knows."""
-        return None
-
-    def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
-        """Add a motion's noise to that of the pose."""
-        motion.predict(self.P)
-
-    def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
-        """Return C_i of r_i = C_i (ε, c̃): [−[ŷ_i]×, I] of ε."""
-        C = self._axes.output_matrix(residuals.landmarks + chord * residuals.r)
-        return self._with_sensor(C, residuals.D)
-
-    def change_of_residuals(self, residuals: Residuals, x: FloatArray) -> FloatArray:
-        """Return H x (m, k)."""
-        C = self.output_matrix(residuals)
-        change: FloatArray = C @ x[: C.shape[2]]
-        return change
-
-    def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return H P and H P Hᵀ of H x = C_i (ε, c̃)."""
-        q = C.shape[2]
-        C = C.reshape(-1, q)
-        HP = C @ self.P[:q]
-        return HP, HP[:, :q] @ C.T
-
-    def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i (ε, c̃) alone."""
-        q = C.shape[-1]
-        PC = self.P[:q, :q] @ transpose(C)
-        return PC[..., : self._p, :], C @ PC
-
-    def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all together, (p, m k) and (m k, m k)."""
-        return self.output(C.reshape(-1, C.shape[2]), rows)
-
-    def remove(self, rows: IntArray) -> None:
-        """Forget landmarks."""
-        self._covariances = np.delete(self._covariances, rows, axis=0)
-
-    def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃."""
-        super().set_pose(covariance, np.empty((0, 3)))
-
-
-def sheared(P: FloatArray, first: int, L: FloatArray) -> FloatArray:
-    """Return the covariance of x whose entries from ``first`` on have grown by L ε, L (…, p)."""
-    p = L.shape[1]
-    result: FloatArray = P.copy()
-    half = L @ P[:p]
-    half[:, first:] += 0.5 * half[:, :p] @ L.T
-    result[first:] += half
-    result[:, first:] += half.T  # its mirror image, so that P stays symmetric
-    return result
+        return self.chart.still(points)

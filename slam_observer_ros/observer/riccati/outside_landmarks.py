@@ -1,121 +1,305 @@
 """Landmarks that are out of view, and how they depend on the local state x of those in view.
 
 Each has the error η_i = ξ_i − [y_i°]× ε_Ω, that of its position with a reference y_i°: it does not
-move while the robot does. Each is kept in a slot, k rows of all arrays, which it keeps while it is
-in view, too; what is there is out of date then, and X is zero. Free slots have zeros.
+move while the robot does; that of a tag's orientation is ω_i itself. Each is kept in a slot, some
+rows of all arrays, which it keeps while it is in view, too; what is there is out of date then, and
+X is zero. What has to be done to all of them is done panel by panel (:class:`Change`).
 """
 
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
-from slam_observer_ros.observer.riccati.panel_matrix import PanelMatrix
+from slam_observer_ros.observer.riccati.panel_matrix import PANEL_ROWS, PanelMatrix
+from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """What has yet to be done to all landmarks as x started again: (q,) entries, then fewer."""
+
+    postponed: PostponedCorrection  # until then
+    root: FloatArray  # (q₀, r) of its Ψ
+    taken: IntArray  # slots that are the last columns of X until then
+    turns: FloatArray  # (s, q) covariance of the angles of ε with x
+    kept: IntArray  # entries of x that stay
+    slots: IntArray  # (m,) landmarks that are not in x any more, ascending
+    points: FloatArray  # (m, 3) their references
+    rows: IntArray  # (m k,) and rows
+    outputs: FloatArray  # (q, m k): their covariance with others is that of x times this
+    own: FloatArray  # (m k, m k) their own
+    to_x: FloatArray  # (m k, …) and with the entries that stay
+
+    @property
+    def weights(self) -> FloatArray:
+        """(r + 2 s,) w of the U diag(w) Uᵀ that is added to B."""
+        s = len(self.turns)
+        return np.repeat([-1.0, 0.5, -0.5], [self.root.shape[1], s, s])
+
+
+@dataclass(slots=True, eq=False)
+class Panel:
+    """The landmarks of a panel. Its arrays are never changed in place: copies share them."""
+
+    X: FloatArray  # (PANEL_ROWS, …) cov(η, x₀), and the first of the columns that are taken
+    own: FloatArray  # (slots, k, k) diagonal blocks of B
+    references: FloatArray  # (slots, 3) y_i°, metres
+    turned: int = 0  # corrections since x began by which tags have been turned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moved:
+    """Landmarks of a panel after a change."""
+
+    panel: Panel
+    shifts: FloatArray  # (slots, 3) how far estimates have been moved, metres
+    turns: FloatArray  # (slots, 3, 3) and turned
+    U: FloatArray  # (PANEL_ROWS, r + 2 s) to be added to B
+    V: FloatArray  # (PANEL_ROWS, m k) the columns of B of those that are not in x any more
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Landmarks of a panel (m,) as they are now, whatever has yet to happen."""
+
+    rows: IntArray  # (m,) which landmarks
+    X: FloatArray  # (m, k, …) with all columns
+    own: FloatArray  # (m, k, k)
+    references: FloatArray  # (m, 3) metres
+    shifts: FloatArray  # (m, 3) how far estimates have yet to be moved, metres
+    turns: FloatArray  # (m, 3, 3) and be turned
+    moved: Moved | None  # what is left to be done to their panel
 
 
 class OutsideLandmarks:
-    """B, the covariance of all η, and X = cov(η, x), both as of one instant."""
+    """B, the covariance of all η, and X = cov(η, x), both as of one instant.
 
-    def __init__(self, point: int, size: int) -> None:
-        self._k = point
+    The variables x of X are those that x had when it last started, (q₀), then the η of landmarks
+    that have been taken in since.
+    """
+
+    def __init__(self, axes: EstimatedAxes, stride: int, size: int) -> None:
+        self._axes, self._stride = axes, stride
         self.matrix = PanelMatrix()  # B
-        # Never changed in place: copies share them.
-        self.X: FloatArray = np.zeros((0, size))  # (k slots, q₀)
-        self.own: FloatArray = np.zeros((0, point, point))  # (slots, k, k) diagonal blocks of B
-        self.references: FloatArray = np.zeros((0, 3))  # (slots, 3) y_i°, metres
-        self._free: list[int] = []
+        self.panels: list[Panel] = []
+        self.size = size  # q₀
+        self.taken: IntArray = np.empty(0, dtype=np.int64)  # (t,) slots
+        self.unchanged: dict[int, Change] = {}  # panels to which one has yet to happen
+        self._unused: list[int] = []
+        self._left: list[int] = []  # slots of landmarks that were removed
 
     def copy(self) -> OutsideLandmarks:
         """Return an independent copy."""
         other = copy(self)
-        other.matrix, other._free = self.matrix.copy(), self._free.copy()
+        other.matrix, other.panels = self.matrix.copy(), [copy(panel) for panel in self.panels]
+        other.unchanged = self.unchanged.copy()
+        other._unused, other._left = self._unused.copy(), self._left.copy()
         return other
 
-    def rows(self, slots: IntArray) -> IntArray:
-        """Return where landmarks are in B and X (m k,)."""
-        return (self._k * slots[:, None] + np.arange(self._k)).ravel()
+    @property
+    def slots_each(self) -> int:
+        """How many slots a panel has."""
+        return PANEL_ROWS // self._stride
 
-    def blocks(self, slots: IntArray) -> FloatArray:
-        """Return the rows of X (m, k, q₀) of landmarks."""
-        blocks: FloatArray = self.X.reshape(-1, self._k, self.X.shape[1])[slots]
-        return blocks
+    def rows(self, slots: IntArray) -> IntArray:
+        """Return where landmarks are in B (m k,)."""
+        return self._rows(slots).ravel()
 
     def new_slots(self, count: int) -> IntArray:
         """Return free slots for so many landmarks, ascending."""
-        if len(self._free) < count:
-            before = len(self.own)
-            self.matrix.extend(self._k * (before + count - len(self._free)))
-            after = len(self.matrix) // self._k
-            room, k = after - before, self._k
-            self.X = np.concatenate([self.X, np.zeros((k * room, self.X.shape[1]))])
-            self.own = np.concatenate([self.own, np.zeros((room, k, k))])
-            self.references = np.concatenate([self.references, np.zeros((room, 3))])
-            self._free += range(before, after)
-        self._free.sort()
-        slots, self._free = self._free[:count], self._free[count:]
+        used = self._left[:count]
+        self._left = self._left[len(used) :]
+        return np.sort(np.append(used, self._unused_slots(count - len(used)))).astype(np.int64)
+
+    def _unused_slots(self, count: int) -> IntArray:
+        """Return slots of which B is zero, ascending."""
+        each, k = self.slots_each, self._stride
+        while len(self._unused) < count:
+            self._unused += range(each * len(self.panels), each * (len(self.panels) + 1))
+            width = self.size + k * len(self.taken)
+            X, own = np.zeros((PANEL_ROWS, width)), np.zeros((each, k, k))
+            self.panels.append(Panel(X, own, np.zeros((each, 3))))
+            self.matrix.append()
+        slots, self._unused = self._unused[:count], self._unused[count:]
         return np.array(slots, dtype=np.int64)
 
     def remove(self, slots: IntArray) -> None:
-        """Forget landmarks."""
-        rows = self.rows(np.sort(slots))
-        self.matrix.set_columns(rows, np.zeros((len(self.X), len(rows))))
-        self.X = self.X.copy()
-        self.X[rows] = 0.0
-        self._free += slots.tolist()
+        """Forget landmarks. What B has of them is replaced with that of others."""
+        self.clear(slots)
+        self._left += slots.tolist()
+
+    def clear(self, slots: IntArray) -> None:
+        """Let X of landmarks be zero."""
+        for number, local in self.by_panel(slots):
+            X = self.panels[number].X.copy()
+            X[self.rows(local)] = 0.0
+            self.panels[number].X = X
+
+    def by_panel(self, slots: IntArray) -> list[tuple[int, IntArray]]:
+        """Return panels, and which of their slots are among these."""
+        numbers = slots // self.slots_each
+        return [
+            (int(number), slots[numbers == number] % self.slots_each)
+            for number in np.unique(numbers)
+        ]
 
     def add_independent(self, points: FloatArray, covariances: FloatArray) -> IntArray:
-        """Add landmarks (m,) whose errors are independent of all else; return their slots."""
-        slots = self.new_slots(len(points))
-        self.matrix.set_blocks(self.rows(slots), covariances)
-        self.own, self.references = self.own.copy(), self.references.copy()
-        self.own[slots], self.references[slots] = covariances, points
+        """Add landmarks (m,) whose errors are independent of all others; return their slots."""
+        slots = self._unused_slots(len(points))
+        self._set_own(slots, slice(self._stride), covariances)
+        self.refer(slots, points)
         return slots
 
-    def put(
-        self,
-        slots: IntArray,
-        points: FloatArray,
-        to_x: FloatArray,
-        own: FloatArray,
-        to_others: FloatArray,
-    ) -> None:
-        """Set all that is known of landmarks (m,), which refer to ``points``; slots ascend.
+    def set_independent(self, slots: IntArray, entries: slice, covariances: FloatArray) -> None:
+        """Let these entries of landmarks (m,), ascending, be independent of all others.
 
-        Their covariances are those with x (m k, q₀), their own (m k, m k), and with all (…, m k).
+        Their covariances are (m, …, …). Nothing may be taken, and no change be going on.
         """
-        rows = self.rows(slots)
-        to_others[rows] = own
-        self.matrix.set_columns(rows, to_others)
-        self.X[rows] = to_x  # it has just been made
-        self.own, self.references = self.own.copy(), self.references.copy()
-        self.own[slots], self.references[slots] = diagonal_blocks(own, self._k), points
+        rows = self._rows(slots)[:, entries].ravel()
+        for number, panel in enumerate(self.panels):
+            self.matrix.set_columns(number, rows, np.zeros((PANEL_ROWS, len(rows))))
+            local = rows[rows // PANEL_ROWS == number] % PANEL_ROWS
+            if len(local):
+                panel.X = panel.X.copy()
+                panel.X[local] = 0.0
+        self._set_own(slots, entries, covariances)
 
-    def subtract(self, F: FloatArray) -> None:
-        """Let B become B − X F Fᵀ Xᵀ."""
-        U = self.X @ F
-        self._add(U, -np.ones(U.shape[1]))
+    def _set_own(self, slots: IntArray, entries: slice, covariances: FloatArray) -> None:
+        """Set what landmarks, ascending, have on the diagonal of B, where nothing is."""
+        begin = 0
+        for number, local in self.by_panel(slots):
+            blocks, panel = covariances[begin : begin + len(local)], self.panels[number]
+            begin += len(local)
+            self.matrix.add_blocks(number, self._rows(local)[:, entries], blocks)
+            panel.own = panel.own.copy()
+            panel.own[local, entries] = panel.own[local, :, entries] = 0.0
+            panel.own[local, entries, entries] = blocks
 
-    def set_references(
-        self, slots: IntArray, points: FloatArray, turns: FloatArray, P: FloatArray
-    ) -> None:
-        """Let landmarks refer to ``points`` (m, 3), by which η grows by ``turns`` (m k, s) ε_Ω.
+    def refer(self, slots: IntArray, points: FloatArray) -> None:
+        """Let landmarks, ascending, refer to ``points`` (m, 3)."""
+        begin = 0
+        for number, local in self.by_panel(slots):
+            references = self.panels[number].references.copy()
+            references[local] = points[begin : begin + len(local)]
+            self.panels[number].references = references
+            begin += len(local)
 
-        These s angles are the first entries of x, of the covariance P.
+    def among(self, slots: IntArray, views: list[View]) -> FloatArray:
+        """Return B (m k, m k) of landmarks, ascending, of which these are the views."""
+        rows, parts = self.rows(slots), self.by_panel(slots)
+        U = [self.matrix.rows_of_U(number) for number, _ in parts]
+        for i, view in enumerate(views):
+            U[i] = U[i] if view.moved is None else np.hstack([U[i], view.moved.U])
+        of_U = [each[self.rows(local)] for each, (_, local) in zip(U, parts, strict=True)]
+        found = self.matrix.among(
+            rows, np.concatenate([np.empty((0, self.matrix.columns_of_U)), *of_U])
+        )
+        # Columns that have yet to be written.
+        end = 0
+        for view, (number, local) in zip(views, parts, strict=True):
+            mine = np.arange(end, end := end + self._stride * len(local))
+            if view.moved is not None:
+                changed = self.unchanged[number].rows
+                at = np.flatnonzero(np.isin(rows, changed))
+                V = view.moved.V[np.ix_(self.rows(local), np.isin(changed, rows))]
+                found[np.ix_(mine, at)], found[np.ix_(at, mine)] = V, V.T
+        return found
+
+    # Changes
+
+    def begin(self, change: Change) -> None:
+        """Begin a change of all landmarks; there may be no other one yet."""
+        self.unchanged = dict.fromkeys(range(len(self.panels)), change)
+        self.taken, self.size = np.empty(0, dtype=np.int64), len(change.kept)
+        self.matrix.begin(change.weights)
+        if not self.panels:
+            self.matrix.end()
+
+    def moved(self, number: int, points: FloatArray, are_out: BoolArray) -> Moved:
+        """Return what a change makes of a panel, of which x does not have those that ``are_out``.
+
+        The change has not yet moved the estimates ``points`` (slots, 3) of its landmarks.
         """
-        s = turns.shape[1]
-        D = np.zeros((len(self.X), s))
-        D[self.rows(slots)] = turns
-        # D Zᵀ + Z Dᵀ, as the difference of two squares.
-        Z = self.X[:, :s] + 0.5 * D @ P[:s, :s]
-        self.X = self.X + D @ P[:s]
-        self._add(np.hstack([D + Z, D - Z]), np.repeat([0.5, -0.5], s))
-        self.references = self.references.copy()
-        self.references[slots] = points
+        change, panel, k = self.unchanged[number], self.panels[number], self._axes.point
+        at = change.slots // self.slots_each == number
+        new = change.slots[at] % self.slots_each  # those that were in x
+        were_out = are_out.copy()
+        were_out[new] = False
+        size = change.postponed.Phi.shape[1] - self._stride * len(change.taken)
+        before = self._completed(number, size, change.taken, were_out)
+        X = before @ change.postponed.Phi.T
+        # Where the estimate has moved to, the reference follows, …
+        was_off = np.where(were_out[:, None], points - panel.references, 0.0)
+        off, each = was_off.copy(), before.reshape(len(points), self._stride, -1)
+        off[:, :k] = change.postponed.shifted(was_off[:, :k], each[:, :k])
+        turns = change.postponed.turns(each[:, k:], panel.turned, self._axes)
+        s = len(change.turns)
+        D = np.zeros((PANEL_ROWS, s))
+        D.reshape(len(points), self._stride, s)[:, :k] = self._axes.turn_matrix(off)[:, :, :s]
+        # … D Zᵀ + Z Dᵀ, as the difference of two squares.
+        Z = X[:, :s] + 0.5 * D @ change.turns[:, :s]
+        U = np.hstack([before @ change.root, D + Z, D - Z])
+        X += D @ change.turns
+        V = X @ change.outputs
+        X = X[:, change.kept]
+        blocks = U.reshape(len(points), self._stride, U.shape[1])
+        own = panel.own + (blocks * change.weights) @ transpose(blocks)
+        references = panel.references + off
+        rows, of_change = self.rows(new), np.repeat(at, self._stride)
+        X[rows], V[rows] = change.to_x[of_change], change.own[of_change]
+        own[new] = diagonal_blocks(change.own, self._stride)[at]
+        references[new] = change.points[at]
+        return Moved(Panel(X, own, references), off - was_off, turns, U, V)
 
-    def _add(self, U: FloatArray, w: FloatArray) -> None:
-        blocks = U.reshape(len(self.own), self._k, len(w))
-        self.own = self.own + (blocks * w) @ transpose(blocks)
-        self.matrix.add(U, w)
+    def make(self, number: int, moved: Moved) -> None:
+        """Let a panel have changed."""
+        change = self.unchanged.pop(number)
+        self.panels[number] = moved.panel
+        self.matrix.add(number, moved.U)
+        self.matrix.set_columns(number, change.rows, moved.V)
+        if not self.unchanged:
+            self.matrix.end()
+
+    def complete(self, number: int, are_out: BoolArray) -> FloatArray:
+        """Return X of a panel with all its columns, and keep it."""
+        X = self._completed(number, self.size, self.taken, are_out)
+        self.panels[number].X = X
+        return X
+
+    def completed(self, number: int, are_out: BoolArray, moved: Moved | None = None) -> FloatArray:
+        """Return the same of a panel that may have been moved, which has yet to happen."""
+        if moved is None:
+            return self._completed(number, self.size, self.taken, are_out)
+        rows, changed = self.rows(np.sort(self.taken)), self.unchanged[number].rows
+        U = np.hstack([self.matrix.rows_of_U(number), moved.U])
+        columns = self.matrix.columns(number, rows, U)
+        of_rows, of_V = np.isin(rows, changed), np.isin(changed, rows)
+        columns[:, of_rows] = moved.V[:, of_V]
+        columns[~np.repeat(are_out, self._stride)] = 0.0
+        return np.hstack([moved.panel.X, columns[:, self._order(self.taken)]])
+
+    def _completed(
+        self, number: int, size: int, taken: IntArray, are_out: BoolArray
+    ) -> FloatArray:
+        """Return X of a panel as x was: of ``size`` entries, and ``taken`` since."""
+        X = self.panels[number].X
+        rest = taken[(X.shape[1] - size) // self._stride :]
+        if not len(rest):
+            return X
+        columns = self.matrix.columns(number, self.rows(np.sort(rest)))
+        columns[~np.repeat(are_out, self._stride)] = 0.0
+        return np.hstack([X, columns[:, self._order(rest)]])
+
+    def _rows(self, slots: IntArray) -> IntArray:
+        rows: IntArray = self._stride * slots[:, None] + np.arange(self._stride)
+        return rows
+
+    def _order(self, slots: IntArray) -> IntArray:
+        """Return where the columns of landmarks are once they are sorted."""
+        return self.rows(np.argsort(np.argsort(slots)))

@@ -2,11 +2,15 @@
 
 It is M = B + U diag(w) Uᵀ. Of B the rows up to the diagonal are kept, in panels of several rows;
 so it grows without a copy, and takes half the memory. U has what is yet to be added to B, which
-costs O(N²) for N rows: that is done panel by panel (:meth:`PanelMatrix.fold`). Copies share the
-panels until they change them.
+costs O(N²) for N rows: that is done panel by panel (:meth:`PanelMatrix.fold`). So is U itself
+made: columns that are *begun* have been given to some panels, and not yet to others, of which M is
+then still what it was before. Copies share what they have until they change it.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,13 +18,10 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.observer.riccati.shared_array import SharedArray
 
 PANEL_ROWS = 96
-"""Rows of a panel: landmarks do not straddle two, in space or in a plane."""
+"""Rows of a panel: landmarks do not straddle two, in space or in a plane, points or tags."""
 
 FOLDED_RANK = 64
-"""Columns of U from which on they are added to B."""
-
-GROWTH = 1.5
-"""By how much more room is made in U than is needed."""
+"""Columns of U that are added to B at a time."""
 
 
 class PanelMatrix:
@@ -29,93 +30,102 @@ class PanelMatrix:
     def __init__(self) -> None:
         self._panels: list[SharedArray] = []  # (PANEL_ROWS, rows up to its last) of B
         self._folded: list[int] = []  # how many columns of U are already in each panel
-        self._U = SharedArray(np.zeros((0, 0)), self)  # with room for more rows and columns
+        # (PANEL_ROWS, …) rows of U; never changed in place: copies share them.
+        self._U: list[FloatArray] = []
         self._w: FloatArray = np.zeros(0)
+        self._rank = 0  # columns of U that all panels have
         self._next = self._target = 0  # the next panel to be folded, up to which column
 
     def __len__(self) -> int:
-        """Return N."""
-        return len(self._panels) * PANEL_ROWS
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of memory."""
-        return sum(shared.array.nbytes for shared in (self._U, *self._panels))
+        """Return how many panels there are."""
+        return len(self._panels)
 
     def copy(self) -> PanelMatrix:
         """Return an independent copy."""
         other = PanelMatrix()
         vars(other).update(vars(self))
         other._panels = [panel.share(other) for panel in self._panels]
-        other._folded, other._U = self._folded.copy(), self._U.share(other)
+        other._folded, other._U = self._folded.copy(), self._U.copy()
         return other
 
-    def extend(self, rows: int) -> None:
-        """Append zeros, so that there are at least so many rows."""
-        while len(self) < rows:
-            panel = np.zeros((PANEL_ROWS, len(self) + PANEL_ROWS))
-            self._panels.append(SharedArray(panel, self))
-            self._folded.append(len(self._w))  # its rows of U are zero so far
-        self._reserve(len(self._w))
+    def append(self) -> None:
+        """Append a panel of zeros."""
+        panel = np.zeros((PANEL_ROWS, PANEL_ROWS * (len(self) + 1)))
+        self._panels.append(SharedArray(panel, self))
+        self._folded.append(self._rank)
+        self._U.append(np.zeros((PANEL_ROWS, len(self._w))))
 
-    def columns(self, indices: IntArray) -> FloatArray:
-        """Return M (N, m) at ascending ``indices`` (m,) of its columns."""
-        found = np.empty((len(self), len(indices)))
-        w, rank = self._w, len(self._w)
-        U = self._U.array[:, :rank]
-        of_indices = U[indices]
-        for number, panel in enumerate(self._panels):
-            start, end = PANEL_ROWS * number, PANEL_ROWS * (number + 1)
-            before, until = np.searchsorted(indices, (start, end))
-            f = self._folded[number]  # what is pending from there on
-            # Left of the diagonal its rows; what is above the diagonal, by symmetry.
-            left, own = of_indices[:until, f:], of_indices[before:until, f:] * w[f:]
-            found[start:end, :until] = panel.array[:, indices[:until]]
-            found[start:end, :until] += (U[start:end, f:] * w[f:]) @ left.T
-            if before < until:
-                found[:start, before:until] = panel.array[indices[before:until] - start, :start].T
-                found[:start, before:until] += U[:start, f:] @ own.T
+    def columns(self, number: int, indices: IntArray, U: FloatArray | None = None) -> FloatArray:
+        """Return the rows of a panel (PANEL_ROWS, m) at ascending ``indices`` (m,) of columns.
+
+        ``U`` are its rows of U if these are not those that it has.
+        """
+        found = np.empty((PANEL_ROWS, len(indices)))
+        own, panel = self._of(number), self._panels[number].array
+        for part, other, local in _by_panel(indices):
+            if other <= number:
+                found[:, part] = panel[:, indices[part]]
+            else:
+                found[:, part] = self._panels[other].array[local, own].T
+            found[:, part] += self._pending(number, other, local, U)
         return found
 
-    def set_columns(self, indices: IntArray, values: FloatArray) -> None:
-        """Replace columns (m,), in ascending order, and the same rows, by ``values`` (N, m)."""
-        self._U = self._U.owned_by(self)
-        self._U.array[indices] = 0.0
-        for number in range(len(self._panels)):
-            start, end = PANEL_ROWS * number, PANEL_ROWS * (number + 1)
-            before, until = np.searchsorted(indices, (start, end))
-            if until:
-                panel = self._writable(number)
-                panel[:, indices[:until]] = values[start:end, :until]
-                panel[indices[before:until] - start] = values[:end, before:until].T
+    def set_columns(self, number: int, indices: IntArray, values: FloatArray) -> None:
+        """Replace them by ``values`` (PANEL_ROWS, m), and with them the same rows."""
+        own, panel = self._of(number), self._writable(number)
+        for part, other, local in _by_panel(indices):
+            new = values[:, part] - self._pending(number, other, local)
+            if other <= number:
+                panel[:, indices[part]] = new
+            if other >= number:
+                self._writable(other)[local, own] = new.T
 
-    def set_blocks(self, indices: IntArray, blocks: FloatArray) -> None:
-        """Replace blocks (m, k, k) on the diagonal, of rows (m k,) that have no other entries."""
-        k = blocks.shape[1]
-        for rows, block in zip(indices.reshape(-1, k), blocks, strict=True):
-            number = int(rows[0]) // PANEL_ROWS
-            panel, start = self._writable(number), int(rows[0])
-            panel[start - PANEL_ROWS * number :][:k, start : start + k] = block
+    def add_blocks(self, number: int, rows: IntArray, blocks: FloatArray) -> None:
+        """Add blocks (m, k, k) on the diagonal, in rows (m, k) of a panel."""
+        columns = rows + PANEL_ROWS * number
+        self._writable(number)[rows[:, :, None], columns[:, None, :]] += blocks
 
-    def add(self, U: FloatArray, w: FloatArray) -> None:
-        """Add U diag(w) Uᵀ, U (N, r)."""
-        before, rank = len(self._w), len(self._w) + len(w)
-        self._reserve(rank)
-        self._U = self._U.owned_by(self)
-        self._U.array[: len(U), before:rank] = U
+    def among(self, indices: IntArray, U: FloatArray) -> FloatArray:
+        """Return M (m, m) at ascending ``indices`` (m,), which have the rows ``U`` of U."""
+        found, w = np.empty((len(indices),) * 2), self._w
+        for part, number, local in _by_panel(indices):
+            left, f = slice(part.stop), self._folded[number]
+            rows = self._panels[number].array[np.ix_(local, indices[left])]
+            rows += (U[part, f:] * w[f:]) @ U[left, f:].T
+            found[part, left], found[left, part] = rows, rows.T
+        return found
+
+    @property
+    def columns_of_U(self) -> int:  # noqa: N802 (as in the formula)
+        """How many columns U has, with those that some panels do not have yet."""
+        return len(self._w)
+
+    def rows_of_U(self, number: int) -> FloatArray:  # noqa: N802 (as in the formula)
+        """Return the rows of U (PANEL_ROWS, …) of a panel."""
+        return self._U[number]
+
+    def begin(self, w: FloatArray) -> None:
+        """Begin to add U diag(w) Uᵀ, of which :meth:`add` gives each panel its rows of U."""
         self._w = np.append(self._w, w)
+
+    def add(self, number: int, U: FloatArray) -> None:
+        """Give a panel its rows of U (PANEL_ROWS, r)."""
+        self._U[number] = np.hstack([self._U[number], U])
+
+    def end(self) -> None:
+        """Let it be known that all panels have theirs."""
+        self._rank = len(self._w)
 
     def fold(self, work: float) -> None:
         """Go on adding U to the panels, one or as many as ``work`` multiplications suffice for."""
         # How much is done at a time may not depend on the clock: a replay has the same bits.
-        rank = len(self._w)
-        if not self._target and rank < FOLDED_RANK:
+        if not self._target and self._rank < FOLDED_RANK:
             return
-        self._target = self._target or rank
-        work *= max(rank / (4.0 * FOLDED_RANK), 1.0)
-        while work > 0.0 and self._next < len(self._panels):
+        self._target = FOLDED_RANK
+        work *= max(self._rank / (4.0 * FOLDED_RANK), 1.0)
+        while work > 0.0 and self._next < len(self):
             work -= self._fold_next()
-        if self._next == len(self._panels):
+        if self._next == len(self):
             self._drop_folded()
 
     def _fold_next(self) -> float:
@@ -124,32 +134,41 @@ class PanelMatrix:
         self._next += 1
         if f >= t:
             return 0.0
-        panel, start, U = self._writable(number), PANEL_ROWS * number, self._U.array
-        panel += (U[start : start + PANEL_ROWS, f:t] * self._w[f:t]) @ U[: panel.shape[1], f:t].T
+        panel, U = self._writable(number), self._U[number][:, f:t] * self._w[f:t]
+        for other in range(number + 1):
+            panel[:, self._of(other)] += U @ self._U[other][:, f:t].T
         self._folded[number] = t
         return float(panel.size * (t - f))
 
     def _drop_folded(self) -> None:
-        """Drop the columns that all panels have."""
+        """Drop the columns that all panels have in B."""
         t = self._target
-        U = np.zeros_like(self._U.array)
-        left = len(self._w) - t
-        U[:, :left] = self._U.array[:, t : t + left]
-        self._U, self._w = SharedArray(U, self), self._w[t:]
-        self._folded = [f - t for f in self._folded]
+        self._U, self._w = [U[:, t:].copy() for U in self._U], self._w[t:]
+        self._folded, self._rank = [f - t for f in self._folded], self._rank - t
         self._next = self._target = 0
+
+    def _pending(
+        self, number: int, other: int, local: IntArray, U: FloatArray | None = None
+    ) -> FloatArray:
+        """Return what U has yet to add to rows of a panel at columns ``local`` of another."""
+        U = self._U[number] if U is None else U
+        f, until = self._folded[max(number, other)], min(U.shape[1], self._U[other].shape[1])
+        right = self._U[other][local, f:until]
+        pending: FloatArray = (U[:, f:until] * self._w[f:until]) @ right.T
+        return pending
+
+    def _of(self, number: int) -> slice:
+        return slice(PANEL_ROWS * number, PANEL_ROWS * (number + 1))
 
     def _writable(self, number: int) -> FloatArray:
         self._panels[number] = panel = self._panels[number].owned_by(self)
         return panel.array
 
-    def _reserve(self, rank: int) -> None:
-        """Make room in U for all rows and so many columns."""
-        rows, columns = self._U.array.shape
-        if rows >= len(self) and columns >= rank:
-            return
-        more_rows = rows if rows >= len(self) else int(GROWTH * len(self))
-        more_columns = columns if columns >= rank else int(GROWTH * rank)
-        U = np.zeros((more_rows, more_columns))
-        U[:rows, :columns] = self._U.array
-        self._U = SharedArray(U, self)
+
+def _by_panel(indices: IntArray) -> Iterator[tuple[slice, int, IntArray]]:
+    """Yield parts of ascending ``indices``, the panel of each, and their rows in it."""
+    numbers = indices // PANEL_ROWS
+    bounds = np.flatnonzero(np.diff(numbers, prepend=-1, append=-1))
+    for begin, end in pairwise(bounds):
+        number = int(numbers[begin])
+        yield slice(begin, end), number, indices[begin:end] - PANEL_ROWS * number

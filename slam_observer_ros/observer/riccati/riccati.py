@@ -19,23 +19,26 @@ from typing import ClassVar, TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3, slam_group
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     mahalanobis,
     solve_symmetric,
     with_blocks,
 )
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
+from slam_observer_ros.observer.chart import Chart
+from slam_observer_ros.observer.filter import OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.orientations import UNKNOWN_RAD
+from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CompressedCovariance,
 )
-from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
-from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
+from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.observer.robust import observation_weights
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -56,7 +59,7 @@ a thing have quite the same centre.
 """
 
 
-class RiccatiFilter(Filter):
+class RiccatiFilter(OrientationGains):
     """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
 
     joint: JointCovariance
@@ -66,11 +69,18 @@ class RiccatiFilter(Filter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        error, matrix = settings.landmark_velocity_stddev, self.observer.covariance
-        self.joint = (
-            MovingLandmarksCovariance(self.axes, self.calibration, matrix, error)
-            if error > 0.0
-            else JointCovariance(self.axes, self.calibration, matrix)
+        # What is estimated of each landmark beside its position, and how little is known of it:
+        # its velocity, or the orientation of a tag at rest.
+        speed = settings.landmark_velocity_stddev
+        self.estimates_orientations = settings.use_tag_orientation and not speed
+        velocity = self.axes.point if speed else 0
+        turn = self.axes.turn if self.estimates_orientations else 0
+        unknown = [UNKNOWN_RAD] * turn + [speed] * velocity
+        self.joint = JointCovariance(
+            Chart(self.axes, self.calibration.count, turn, velocity),
+            self.observer.covariance,
+            self.calibration.initial_covariance(),
+            np.array(unknown) ** 2,
         )
 
     def copy(self) -> Self:
@@ -86,6 +96,11 @@ class RiccatiFilter(Filter):
         points = observer.y_ref[active] + observer.a[active]
         self.joint.propagate(motion, points, observer.u[active])
         self.motion_noise.factors.move(motion.noise_by_kind)
+
+    def residuals(self, rows: IntArray, seen: SeenPoints, dt_s: FloatArray) -> Residuals:
+        """Return what landmarks (m,), which are going to correct the state, say against it."""
+        self.joint.activate(rows)
+        return super().residuals(rows, seen, dt_s)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
@@ -155,14 +170,12 @@ class RiccatiFilter(Filter):
             self.joint.add_calibration(sensor.variances)
             self._compress_if_large(0)
 
-    def add(
-        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
-    ) -> None:
-        """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
-        self._compress_if_large(len(points))
-        super().add(points, covariances)
+    def add(self, seen: SeenPoints) -> None:
+        """Append landmarks seen for the first time."""
+        self._compress_if_large(len(seen.points))
+        super().add(seen)
         self.motion_noise.factors.forget_motion()  # until now, which is none of theirs
-        self.joint.add_seen(self.observer.turned(covariances), D)
+        self.joint.add_seen(self.observer.turned(seen.covariances), seen.D)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks whose errors are independent of all else, or only of all others."""
@@ -176,27 +189,21 @@ class RiccatiFilter(Filter):
         super().add_known(known)
         self._compress_if_large(0)
 
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
+    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
         self.joint.activate(rows)
-        super().relocate(rows, points, covariances)
-        self.joint.relocate(rows, self.observer.turned(covariances), D)
+        super().relocate(rows, seen)
+        self.joint.relocate(rows, self.observer.turned(seen.covariances), seen.D)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
-        super().remove(rows)
         self.joint.remove(rows)
+        super().remove(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact; P is that of pose and calibration from now on."""
         super().fix_landmarks(y_ref, covariances)
-        self.joint = ExactMapCovariance(self.axes, self.joint, covariances)
+        self.joint = ExactMapCovariance(self.joint, covariances)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
@@ -206,15 +213,14 @@ class RiccatiFilter(Filter):
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
-        # A motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v (G), and the positions
-        # of the known landmarks by J γ.
+        # A motion exp(γ) of everything changes x by G γ, and the positions of the known landmarks
+        # by J γ.
         self.joint = joint = self.joint.dense()
         k = self.axes.point
-        G = joint.gauge(len(self.observer.y_ref))
+        G = joint.chart.gauge(len(self.observer))
         J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
-        to_position = -self.axes.turn_matrix(self.observer.points[rows])
-        HP, HPH = joint.project(to_position, rows)  # of −ã_i
+        HP, HPH = joint.project(joint.chart.still(self.observer.points[rows]), rows)  # of −ã_i
         R = block_diagonal(covariances[:, :k, :k])
         x, joint.P = anchor(joint.P, G, -HP.T, HPH + R, J, r[:, :k].ravel())
         self._move(-x)
@@ -228,15 +234,18 @@ class RiccatiFilter(Filter):
             super().enter_map(rows, known)
             return
         # The map beside the estimate, whose gauge γ does not move it, …
-        n, m = len(self.observer.y_ref), len(rows)
+        n, m = len(self.observer), len(rows)
         own = self.points[rows]
         self.add_known(known)
         self.joint = joint = self.joint.dense()
         added = n + np.arange(len(known))
         copies = added[:m]
-        G = joint.gauge(n) + joint.at_rest(added, known.points)
+        chart, size = joint.chart, len(self.observer)
+        G = chart.gauge(size)
+        G[chart.of_landmarks(added)] = 0.0
+        G += chart.at_rest(size, added, known.points)
         # … and landmarks that both have are the same.
-        H = joint.difference(rows, copies, own, known.points[:m])
+        H = chart.difference(size, rows, copies, own, known.points[:m])
         PH, r = joint.P @ H.T, (own - known.points[:m])[:, : self.axes.point].ravel()
         x, joint.P = anchor(joint.P, G, PH, H @ PH, H @ G, r)
         self._move(-x)
@@ -256,7 +265,7 @@ class RiccatiFilter(Filter):
         # At the end of a loop the map may turn so far that it has to be linearised again.
         for _ in range(MERGER_ROUNDS):
             own, other = np.split(self._moved_points(both, -x), [m])
-            H = joint.difference(rows, copies, own, other)
+            H = joint.chart.difference(len(self.observer), rows, copies, own, other)
             HP, r = H @ joint.P, (own - other)[:, : self.axes.point].ravel() + H @ x
             S = HP @ H.T + SAME_M**2 * np.eye(len(r))
             weighted = solve_symmetric(S, r)
@@ -271,11 +280,8 @@ class RiccatiFilter(Filter):
 
     def _moved_points(self, rows: IntArray, x: FloatArray) -> FloatArray:
         """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
-        X = slam_group.exp(self.axes.full_pose(x[: self.axes.p]), self.joint.split(x)[0][rows])
-        return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a)
-
-    def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
-        """Merge those of landmarks ``rows`` (m,) with the map's, which are at ``copies``."""
+        X = self.joint.chart.step(x).X
+        return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a[rows])
 
     @property
     def calibration_variances(self) -> FloatArray:
@@ -301,39 +307,35 @@ class RiccatiFilter(Filter):
     @property
     def points(self) -> FloatArray:
         """(n, 3) estimated landmarks, reference frame, metres."""
-        points = self.observer.points
-        if not self.joint.is_dense:
-            points += self.joint.postponed_shifts(np.arange(len(points)))
-        return points
+        observer = self.observer
+        return observer.y_ref + self.joint.followed(np.arange(len(observer)), observer.a)
 
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
-        if self.joint.is_dense:
-            return super().expected_points(rows)
         observer = self.observer
-        points = observer.y_ref[rows] + self.translations(rows)
-        return observer.in_body_frame(points)
+        y_ref, a = (of.take(rows, axis=0, mode='wrap') for of in (observer.y_ref, observer.a))
+        return observer.in_body_frame(y_ref + self.joint.followed(rows, a))
 
     def translations(self, rows: IntArray) -> FloatArray:
         """Return â_i (m, 3) of landmarks, metres."""
-        a = super().translations(rows)
-        return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
+        return self.joint.followed(rows, super().translations(rows))
 
     def _compress_if_large(self, added: int) -> None:
-        """Go on with a covariance for many landmarks, unless they move or have orientations."""
-        is_large = len(self.observer.y_ref) + added > self.block.dense
+        """Go on with a covariance for many landmarks, unless they move."""
+        # Tags count by what is estimated of them: relinearising ends there, too.
+        count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
+        is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        if self.joint.is_dense and is_large and not may_move and self.orientations is None:
+        if self.joint.is_dense and is_large and not may_move:
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
-        """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
-        p, first, observer = self.axes.p, self.joint.first, self.observer
-        self.calibration.shift(x[p:first])
-        xi, u = self.joint.split(x)
-        X = slam_group.exp(self.axes.full_pose(x[:p]), xi)
-        moved = self.joint.active  # none in an exact map
+        step, observer = self.joint.chart.step(x), self.observer
+        self.calibration.shift(step.calibration)
+        X, moved = step.X, self.joint.active  # none in an exact map
         turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
         observer.correct(X.A, moved, X.a + turned)
-        if u is not None:
-            observer.correct_velocities(X.A, u)
+        if step.velocities is not None:
+            observer.correct_velocities(X.A, moved, step.velocities)
+        if step.turns is not None:
+            self.orientations.turn(moved, so3.exp(step.turns))

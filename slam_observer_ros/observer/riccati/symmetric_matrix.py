@@ -58,15 +58,11 @@ class SymmetricMatrix:
 
     def subtract_square(self, W: FloatArray) -> None:
         """Subtract Wᵀ W for W (q, N)."""
-        wide = self._widened(W).T
-        dsyrk(-1.0, wide, beta=1.0, c=self._storage.T, lower=1, overwrite_c=1)
-        self._mirror()
+        subtract_square(self._storage, self._size, self._widened(W))
 
     def add_symmetric_product(self, A: FloatArray, B: FloatArray) -> None:
         """Add Aᵀ B + Bᵀ A for A and B (q, N)."""
-        A, B = self._widened(A).T, self._widened(B).T
-        dsyr2k(1.0, A, B, beta=1.0, c=self._storage.T, lower=1, overwrite_c=1)
-        self._mirror()
+        add_symmetric_product(self._storage, self._size, self._widened(A), self._widened(B))
 
     def _widened(self, rows: FloatArray) -> FloatArray:
         """Return rows (q, N) with zeros for the room that is left."""
@@ -76,11 +72,23 @@ class SymmetricMatrix:
         wide[:, : self._size] = rows
         return wide
 
-    def _mirror(self) -> None:
-        """Copy the upper triangle, the one that BLAS takes for a lower one, to the lower one."""
-        M, size = self._storage, self._size
-        for begin in range(0, size, _BLOCK):
-            end = min(begin + _BLOCK, size)
-            M[end:size, begin:end] = M[begin:end, end:size].T
-            block = M[begin:end, begin:end]
-            np.copyto(block, block.T, where=_LOWER[: end - begin, : end - begin])
+
+def subtract_square(M: FloatArray, size: int, W: FloatArray) -> None:
+    """Subtract Wᵀ W, W (q, room) zero from ``size`` on, from the symmetric M (room, room)."""
+    dsyrk(-1.0, W.T, beta=1.0, c=M.T, lower=1, overwrite_c=1)
+    _mirror(M, size)
+
+
+def add_symmetric_product(M: FloatArray, size: int, A: FloatArray, B: FloatArray) -> None:
+    """Add Aᵀ B + Bᵀ A likewise, for A and B (q, room)."""
+    dsyr2k(1.0, A.T, B.T, beta=1.0, c=M.T, lower=1, overwrite_c=1)
+    _mirror(M, size)
+
+
+def _mirror(M: FloatArray, size: int) -> None:
+    """Copy the upper triangle, the one that BLAS takes for a lower one, to the lower one."""
+    for begin in range(0, size, _BLOCK):
+        end = min(begin + _BLOCK, size)
+        M[end:size, begin:end] = M[begin:end, end:size].T
+        block = M[begin:end, begin:end]
+        np.copyto(block, block.T, where=_LOWER[: end - begin, : end - begin])

@@ -193,7 +193,7 @@ function rows() {
   }
   if (fit.length) all.push({ title: 'NIS, NEES', traces: fit, axis: { type: 'log', dtick: 1 } });
   for (const part of run.calibration) {
-    const x = run.errors.t, up = part.value.map((/** @type {number} */ v, /** @type {number} */ i) => v + part.deviation[i]);
+    const x = part.t, up = part.value.map((/** @type {number} */ v, /** @type {number} */ i) => v + part.deviation[i]);
     const down = part.value.map((/** @type {number} */ v, /** @type {number} */ i) => v - part.deviation[i]);
     all.push({
       title: `${part.name.replaceAll('_', ' ')}${part.unit ? `<br>[${part.unit}]` : ''}`, small: true,

@@ -1,0 +1,417 @@
+"""What stands still in the robot's frame while odometry says that the robot drives on.
+
+If all does, the robot stands and its wheels spin, for as long as that lasts: each observation is
+off by too little to be rejected, and pose and landmarks would be dragged along. So would they if
+it turns and slides. If some of it stands while other landmarks pass as odometry has it, the robot
+carries them along: these are not places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+import math
+from typing import TypeAlias
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.sensor_models.integration import integrate
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.state.state import State
+
+TEST_NS, LONGEST_WAIT_NS = to_ns(0.25), to_ns(1.0)
+"""How often what is in view is compared with what was: at the most, and at least."""
+
+LAST_TEST_NS = to_ns(15.0)
+"""For how long it is compared with the same look, where it passes slowly."""
+
+SLIPS = (np.zeros(6), np.repeat([1.0, 0.0], 3))
+"""Shares (6,) of a motion that are made where wheels spin: nothing, or the turn alone."""
+
+NOISE = 3.0
+"""Standard deviations of what a sensor says, within which a landmark is where it should be."""
+
+MOVED = 2.0
+"""Standard deviations from which on a landmark has hardly stood still."""
+
+CLEAR = 6.0
+"""Standard deviations from which on a motion, or a shift in the robot's frame, is clear."""
+
+USUAL = 4.0
+"""Standard deviations, in the mean, with which it is quickly seen what passes."""
+
+FORGOTTEN = 0.95
+"""What is left of the way that this took after each time, as the noise may be less now."""
+
+CERTAIN = 2.0 * CLEAR**2
+"""Evidence with which a landmark is carried, at most: two looks or more, −2 ln of a likelihood."""
+
+LEAST = 2
+"""Landmarks that must agree on a slip: one alone may move as the robot does."""
+
+MOST = 0.75
+"""Share of the landmarks in view that stands for all of them: some points are false."""
+
+UNSEEN_NS = to_ns(1.0)
+"""For how long a slip goes on unseen."""
+
+MAX_MOTIONS = 500
+"""Motions between observations that are remembered."""
+
+
+Move: TypeAlias = tuple[FloatArray, FloatArray]
+"""Â (4, 4) before a motion by odometry, and after it; the corrections are in between."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """An observation, and how many of the moves that are remembered were before it."""
+
+    event: ObservationEvent
+    moves: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Landmarks (m,) that a sensor has seen twice, and points (m, 3) of theirs, body frame."""
+
+    event: ObservationEvent  # the later one …
+    rows: list[int]  # … and which of its points these are
+    ids: list[int]
+    before: FloatArray
+    points: FloatArray
+    expected: FloatArray  # where odometry has them
+    motion: FloatArray  # (4, 4) in between, by odometry
+    since_ns: int
+
+    @classmethod
+    def of(cls, start: _Look, now: _Look, moved: list[Move]) -> _Pairs:
+        """Return those of two looks, between which the robot has ``moved`` by odometry."""
+        first = {i: row for row, i in enumerate(start.event.ids.tolist()) if i != UNKNOWN_ID}
+        both = [(row, i) for row, i in enumerate(now.event.ids.tolist()) if i in first]
+        rows, ids = [row for row, _ in both], [i for _, i in both]
+        before = start.event.points[[first[i] for i in ids]]
+        motion = _product(moved)
+        expected = (before - motion[:3, 3]).dot(motion[:3, :3])
+        points = now.event.points[rows]
+        return cls(now.event, rows, ids, before, points, expected, motion, start.event.stamp_ns)
+
+    @property
+    def lagging(self) -> list[int]:
+        """Those that have not gone half of the way that they should have gone."""
+        way, made = self.expected - self.before, self.points - self.before
+        ahead = np.einsum('ij,ij->i', made - 0.5 * way, way).tolist()
+        return [i for i, much in zip(self.ids, ahead, strict=True) if much <= 0.0]
+
+    @property
+    def squared_way(self) -> float:
+        """Sum of the squares of the ways that they should have gone, m²."""
+        way = (self.expected - self.before).ravel()
+        return float(way.dot(way))
+
+    def after(self, share: FloatArray) -> FloatArray:
+        """Return where (m, 3) they should be if a ``share`` (6,) of the motion was made."""
+        back = se3.exp(-share * se3.log(self.motion))
+        return se3.transform(back, self.before)
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """What landmarks (m,) have done in the robot's frame, in standard deviations."""
+
+    ids: list[int]
+    shift: FloatArray  # from where each was
+    way: FloatArray  # by odometry, which may be off as well
+    error: FloatArray  # from where that has it
+    slipped: FloatArray  # (s, m) from where each of the SLIPS has it
+    off: FloatArray  # (m, k) the error in metres, body frame
+    noise: FloatArray  # (m, k, k) of the sensor in both observations, m²
+    C: FloatArray  # (m, k, p) how the motion's error moves each
+    motion_noise: FloatArray  # (p, p)
+
+    @classmethod
+    def of(cls, state: State, seen: list[_Pairs], velocities: VelocityHistory) -> _View:
+        """Return what pairs of points of one sensor or several show."""
+        k, A = state.axes.point, state.observer.A
+        noise = _noise(state, seen)
+        now = np.concatenate([pairs.points for pairs in seen])
+        before = np.concatenate([pairs.before for pairs in seen])
+        expected = np.concatenate([pairs.expected for pairs in seen])
+        slipped = [np.concatenate([pairs.after(share) for pairs in seen]) for share in SLIPS]
+        shifts = (now - np.array([before, *slipped]))[:, :, :k]
+        squared = np.einsum('smi,mij,smj->sm', shifts, np.linalg.inv(noise), shifts)
+        shift, *slips = np.sqrt(np.maximum(squared, 0.0))
+        C = transpose(A[:k, :k]) @ state.axes.output_matrix(se3.transform(A, expected))
+        longest = min(seen, key=lambda pairs: pairs.since_ns)
+        motion_noise = _motion_noise(state, longest, velocities)
+        S, way = noise + C @ motion_noise @ transpose(C), (expected - before)[:, :k]
+        off = (now - expected)[:, :k]
+        error, way = mahalanobis(off, S), mahalanobis(way, S)
+        ids = [landmark_id for pairs in seen for landmark_id in pairs.ids]
+        return cls(ids, shift, way, error, np.array(slips), off, noise, C, motion_noise)
+
+    @property
+    def passes(self) -> BoolArray:
+        """Which (m,) are clearly elsewhere, and nearer to where odometry has them."""
+        return (self.shift > CLEAR) & (2.0 * self.error < self.shift)
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether most have neither stood nor gone as odometry says."""
+        neither = (self.shift > MOVED) & (self.error > NOISE)
+        return bool(2 * np.count_nonzero(neither) > len(neither))
+
+    def shows(self, slipped: FloatArray, places: BoolArray) -> bool:
+        """Return whether places say so of a slip that has landmarks ``slipped`` (m,) off.
+
+        And clearly so, beside what odometry may be off by.
+        """
+        gain, agree = self.error**2 - slipped**2, places & (slipped <= NOISE)
+        differ = places & (slipped > NOISE) & (gain < -(NOISE**2))
+        if (
+            np.count_nonzero(agree & (gain > NOISE**2)) < LEAST
+            or np.count_nonzero(agree) < MOST * np.count_nonzero(places)
+            or differ.any()
+        ):
+            return False
+        C, off = self.C[agree].reshape(-1, self.C.shape[-1]), self.off[agree].ravel()
+        S = with_blocks(C @ self.motion_noise @ C.T, self.noise[agree])
+        return bool(off @ np.linalg.solve(S, off) - np.sum(slipped[agree] ** 2) > CLEAR**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """What odometry says of a motion that was not made."""
+
+    back: FloatArray  # (4, 4) motion from where odometry has the robot
+    stray: FloatArray  # (6,) twist of what may not have been made in all
+
+
+@dataclass(slots=True)
+class Standing:
+    """Whether the robot stands while its wheels spin, and which landmarks it carries along."""
+
+    carried: set[int] = field(default_factory=set)
+    excluded: set[int] = field(default_factory=set)  # that may be carried, and those that are
+    slip: int | None = None  # which of the SLIPS goes on
+    moved: list[Move] = field(default_factory=list)  # by odometry, since a start …
+    sensor_frame: str = ''  # an observation is due from another one, …
+    due_ns: int = 0  # … or from here on
+    _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
+    _starts: dict[str, _Look] = field(default_factory=dict)  # what is compared with, by sensor
+    _latest: dict[str, _Look] = field(default_factory=dict)
+    _tested: dict[str, _Look] = field(default_factory=dict)  # the latest when that was judged
+    _test_ns: int = 0
+    _wait_ns: int = TEST_NS  # until so much has passed that it is clear
+    _odd: set[int] = field(default_factory=set)  # what did not pass as it should have
+    _usual_m2: float = 0.0  # mean square of the ways from which on it is clear what passes, …
+    _enough_m2: float = 0.0  # … or with which it is judged again
+    _confirmed_ns: int = 0  # when it was seen last that a slip goes on
+    _earlier: list[Move] = field(default_factory=list)  # … and that before
+
+    def clear_time(self) -> None:
+        """Compare nothing with what was seen before."""
+        self.slip, self.due_ns = None, 0
+        self._starts, self._latest, self._tested = {}, {}, {}
+        self.moved, self._earlier = [], []
+
+    def note(
+        self, state: State, event: ObservationEvent, velocities: VelocityHistory
+    ) -> Lost | None:
+        """Judge an observation that is due and yet to be used, by the most likely state.
+
+        Return what was not made of the motion since the last observation if the wheels slip.
+        """
+        if event.velocities is not None:
+            return None  # landmarks may move as the robot does
+        look, lost = _Look(event, len(self.moved)), None
+        if self.slip is not None:
+            lost = self._go_on(state, look)
+        elif event.sensor_frame in self._starts:
+            self._latest[event.sensor_frame] = look
+            if event.stamp_ns >= self._test_ns:
+                lost = self._test(state, look, velocities)
+        elif self._starts:
+            self._starts[event.sensor_frame] = look
+        else:
+            self._begin(event)
+        some_wait = self.slip is not None or len(self._starts) > 1
+        self.due_ns = 0 if some_wait else self._test_ns
+        return lost
+
+    def _begin(self, event: ObservationEvent) -> None:
+        """Compare with this observation from now on."""
+        self.sensor_frame = event.sensor_frame
+        self._starts, self._latest = {event.sensor_frame: _Look(event, 0)}, {}
+        self._earlier, self.moved = self.moved, []
+        self._tested, self._enough_m2 = {}, self._usual_m2
+        self._test_ns = event.stamp_ns + self._wait_ns
+
+    def _test(self, state: State, look: _Look, velocities: VelocityHistory) -> Lost | None:
+        """Look for a slip, and for landmarks that are carried along."""
+        event, seen = look.event, self._pairs()
+        ids = [i for pairs in seen for i in pairs.ids]
+        if len(ids) < LEAST:
+            self._begin(event)
+            return None
+        tested, self._tested = self._tested, dict(self._latest)
+        way_m2 = sum(pairs.squared_way for pairs in seen) / len(ids)
+        age_ns = event.stamp_ns - self._starts[event.sensor_frame].event.stamp_ns
+        needed = math.sqrt(self._usual_m2 / way_m2) if way_m2 else math.inf
+        self._wait_ns = int(min(max(needed * age_ns, TEST_NS), LONGEST_WAIT_NS))
+        self._test_ns = event.stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
+        if way_m2 <= self._enough_m2:
+            if age_ns > LAST_TEST_NS:
+                self._begin(event)
+            return None
+        is_usual = self._is_usual(ids, {i for pairs in seen for i in pairs.lagging})
+        if is_usual or state.landmark_velocity_stddev:
+            self._usual_m2 *= FORGOTTEN
+            self._begin(event)
+            return None
+        view = _View.of(state, seen, velocities)
+        self._usual_m2 = way_m2 * USUAL**2 / np.mean(view.way**2)
+        self._enough_m2 = 2.0 * way_m2
+        if self._slips(state, view):
+            self._confirmed_ns, self._starts = event.stamp_ns, self._latest
+            lost = self._lost(self.moved[-1:], self._earlier + self.moved)
+            self.moved = []
+            return lost
+        if view.passes.any():
+            self._sort(view)
+            self._begin(event)
+        elif view.is_mixed and tested:
+            # A slip has begun meanwhile, or ended.
+            self._starts, self._tested, self._enough_m2 = tested, {}, 0.0
+            return self._test(state, look, velocities)
+        return None
+
+    def _is_usual(self, ids: list[int], lagging: set[int]) -> bool:
+        """Return whether all passes but for what is carried, and now and then for one more."""
+        odd = lagging ^ self.carried.intersection(ids)
+        before, self._odd = self._odd, odd
+        return 2 * len(odd) < len(ids) and odd.isdisjoint(before)
+
+    def _pairs(self) -> list[_Pairs]:
+        """Return what each sensor has seen at the start and lately, where it has."""
+        looks = [(self._starts[name], now) for name, now in self._latest.items()]
+        seen = [_Pairs.of(a, b, self.moved[a.moves : b.moves]) for a, b in looks]
+        return [pairs for pairs in seen if pairs.ids]
+
+    def _slips(self, state: State, view: _View) -> bool:
+        """Find out whether one of the SLIPS has begun."""
+        places = self._are_places(state, view.ids)
+        for slip, slipped in enumerate(view.slipped):
+            if view.shows(slipped, places):
+                self.slip = slip
+                return True
+        return False
+
+    def _go_on(self, state: State, look: _Look) -> Lost | None:
+        """Return what :meth:`note` does during a slip, or None once it is over."""
+        event, made = look.event, self.moved
+        self._slip_on(made)
+        start = self._starts.setdefault(event.sensor_frame, _Look(event, 0))
+        pairs, agree = _Pairs.of(start, look, []), np.empty(0, dtype=np.bool_)
+        if pairs.ids:
+            shift = (pairs.points - pairs.before)[:, : state.axes.point]
+            agree = mahalanobis(shift, _noise(state, [pairs])) <= NOISE
+            agree = agree[self._are_places(state, pairs.ids)]
+        if start.event is not event and np.count_nonzero(agree) >= LEAST:
+            self._confirmed_ns = event.stamp_ns
+            if self.slip and event.stamp_ns - start.event.stamp_ns > UNSEEN_NS:
+                self._starts = {event.sensor_frame: _Look(event, 0)}  # whose turn is exact
+        is_unseen = event.stamp_ns - self._confirmed_ns > UNSEEN_NS
+        if 2 * np.count_nonzero(agree) < len(agree) or is_unseen:
+            self.slip = None
+            self._begin(event)
+            return None
+        return self._lost(made, made)
+
+    def _slip_on(self, made: list[Move]) -> None:
+        """Move what is compared with by what a slip makes of motions; forget these."""
+        back = se3.exp(-SLIPS[self.slip or 0] * se3.log(_product(made)))
+        for name, start in self._starts.items():
+            points = se3.transform(back, start.event.points)
+            self._starts[name] = _Look(replace(start.event, points=points), 0)
+        self.moved = []
+
+    def _lost(self, made: list[Move], whole: list[Move]) -> Lost:
+        """Return what was lost of motions, and may be of others."""
+        share, motion = SLIPS[self.slip or 0], _product(made)
+        back = se3.inverse(motion).dot(se3.exp(share * se3.log(motion)))
+        return Lost(back, (1.0 - share) * se3.log(_product(whole)))
+
+    def _are_places(self, state: State, ids: list[int]) -> BoolArray:
+        """Return which landmarks (m,) are at rest, as far as is known."""
+        places = np.array([i not in self.excluded for i in ids], dtype=np.bool_)
+        if not state.is_mapping:
+            places &= state.landmarks.rows_of(np.array(ids)) >= 0
+        return places
+
+    def _sort(self, view: _View) -> None:
+        """Find out which landmarks stand still while others pass."""
+        gain = np.clip(view.error**2 - view.shift**2, -(CLEAR**2), CLEAR**2)
+        gain[(gain > 0.0) & (view.shift > NOISE)] = 0.0
+        for landmark_id, more in zip(view.ids, gain.tolist(), strict=True):
+            much = self._evidence.get(landmark_id, 0.0) + more
+            self._evidence[landmark_id] = min(max(much, 0.0), CERTAIN)
+        evidence = self._evidence = {i: much for i, much in self._evidence.items() if much}
+        self.carried = {i for i, much in evidence.items() if much == CERTAIN or i in self.carried}
+        self.excluded = self.carried | {i for i, much in evidence.items() if much >= CLEAR**2}
+
+
+def _noise(state: State, seen: list[_Pairs]) -> FloatArray:
+    """Return the covariances (m, k, k) of both points of landmarks that stand, m²."""
+    each = [state.observation_noise.covariances(pairs.event)[pairs.rows] for pairs in seen]
+    both: FloatArray = 2.0 * np.concatenate(each)[:, : state.axes.point, : state.axes.point]
+    return both
+
+
+def _product(moved: list[Move]) -> FloatArray:
+    """Return moves, one after the other, as one motion (4, 4), in the frame at their start."""
+    if not moved:
+        return np.eye(4)
+    befores, afters = np.array(moved).swapaxes(0, 1)
+    whole, *others = np.linalg.solve(befores, afters)
+    for step in others:
+        whole = whole.dot(step)
+    product: FloatArray = whole
+    return product
+
+
+def _motion_noise(state: State, pairs: _Pairs, velocities: VelocityHistory) -> FloatArray:
+    """Return the covariance (p, p) of the motion between them, with that of its bias."""
+    calibration, end_ns = state.filter.calibration, pairs.event.stamp_ns
+    # What led there so long ago that it is forgotten was off by as much.
+    since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)
+    start = state.observer.A.dot(se3.inverse(pairs.motion))
+    motion = integrate(velocities, calibration, state.motion_noise, start, since_ns, end_ns, None)
+    longer = (end_ns - pairs.since_ns) / max(end_ns - since_ns, 1)
+    F = longer * motion.sensitivity
+    # As it is stated: what slips and carried landmarks have added to it is no reason to wait.
+    noise = longer / max(1.0, state.motion_noise.factors.applied.max()) * motion.noise
+    total: FloatArray = noise + (F * state.filter.calibration_variances) @ F.T
+    return total
+
+
+def take_back(state: State, lost: Lost) -> None:
+    """Take back what was not made of the last motion."""
+    A, (turn, way) = state.observer.A, lost.stray.reshape(2, 3)
+    motion = Motion(
+        path=np.array([A, A @ lost.back]),
+        measured_velocities=np.zeros((1, 6)),
+        dt_s=np.zeros(1),
+        covariances=block_diag(np.outer(turn, turn), np.outer(way, way))[None],
+        duration_s=0.0,
+        at_ends=None,
+        calibration=state.filter.calibration,
+        is_slip=True,
+    )
+    state.propagate(motion)

@@ -1,0 +1,251 @@
+"""``slam-observer calibrate``: mount, scales, biases, delay and noise of sensor and odometry."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from slam_observer_ros.cli.calibrate.finder import Finder
+from slam_observer_ros.cli.calibrate.stated import (
+    depth_text,
+    Found,
+    is_off,
+    is_seen,
+    looked_for,
+    state_found,
+    Stated,
+    with_noise,
+)
+from slam_observer_ros.cli.console import (
+    muted_warnings,
+    print_columns,
+    print_json,
+    print_table,
+    shown_steps,
+)
+from slam_observer_ros.cli.options import add_settings_options, Given, named_path, read_given
+from slam_observer_ros.cli.outputs import (
+    add_force_option,
+    check_inputs_are_kept,
+    check_outputs,
+)
+from slam_observer_ros.cli.replay.request import add_input_options, read_request, ReplayRequest
+from slam_observer_ros.cli.replay.run import select_inputs
+from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
+from slam_observer_ros.cli.tune.tuned_file import (
+    certainty,
+    judged_lines,
+    verdict_lines,
+    write_found,
+)
+from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
+from slam_observer_ros.common.errors import IncompleteError, UsageError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.recording.opening import files_of
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.health import of_mounting, of_noise
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import InputSettings
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        'Find how the sensor of landmarks is mounted, the scale of its ranges, or whether they '
+        'are depths, the delay, scales and biases of the velocities, and the noise of points: '
+        'what makes a drive most likely. In a surveyed map all of it is found, without one not '
+        'the scales. What --set states of a standard deviation is kept. What is found must hold '
+        'on what was held out: the last third, or other recordings. If it does not, no file is '
+        'written, and the exit code is 4.'
+    )
+    parser.add_argument('recording', type=named_path, metavar='RECORDING')
+    parser.add_argument(
+        '--map',
+        dest='survey',
+        type=named_path,
+        metavar='SURVEY.yaml',
+        help='map file of surveyed landmarks',
+    )
+    parser.add_argument(
+        '--hold-out',
+        action='append',
+        default=[],
+        type=named_path,
+        metavar='RECORDING',
+        help='hold this one out, and take all of the other; may be given several times',
+    )
+    parser.add_argument(
+        '--keep-noise',
+        action='store_true',
+        help='leave the noise of points as it is stated, which takes a third of the time',
+    )
+    outputs = parser.add_argument_group('outputs')
+    outputs.add_argument(
+        '-o',
+        '--out',
+        type=named_path,
+        metavar='FILE',
+        help='parameter file to write if it is an improvement',
+    )
+    outputs.add_argument('--json', action='store_true', help='print one JSON object')
+    add_force_option(parser)
+    add_input_options(parser)
+    add_settings_options(parser, InputSettings)
+    parser.set_defaults(run=run, smooth=False, load_map=None)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Calibrate by a recording, and judge on what was held out."""
+    given = read_given(args)
+    request = read_request(args, given, args.recording)
+    if not DESIGNS[request.settings.gains].has_joint_covariance:
+        raise UsageError(f'calibrate needs riccati gains, not {request.settings.gains}')
+    read = {f'the recording {path}': files_of(path) for path in (args.recording, *args.hold_out)}
+    survey = None
+    if args.survey is not None:
+        read['the map'] = [args.survey]
+        survey = read_map(args.survey)
+        if request.settings.localization_mode == 'off':
+            request = request.with_values({'localization_mode': 'uncertain'})
+    check_inputs_are_kept({'--out': args.out}, read)
+    check_outputs([args.out], args.force)
+    share = 0.0 if args.hold_out else HELD_OUT_SHARE
+    material = read_material(request, share, survey)
+    # What the settings that are tried give reason to warn of is nobody's concern.
+    with muted_warnings(), shown_steps('calibrating') as advance:
+        found = Finder(material, request.settings, given.assigned, advance).find(args.keep_noise)
+        pose = _sensor_pose(request, found)
+        stated = state_found(request.settings, request.inputs, found, pose)
+        stated, verdict = _judged(request, args.hold_out, material, stated, found)
+    _print(args, material, found, stated, verdict)
+    if verdict.objection:
+        raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
+    if args.out is not None:
+        _write(args, given, material, found, stated, verdict)
+
+
+def _sensor_pose(request: ReplayRequest, found: Found) -> FloatArray | None:
+    """Return the pose (4, 4) of the only sensor; None if there are several, or it moves."""
+    if len(found.frames) != 1:
+        return None
+    with Recording(request.recording) as recording:
+        selected, inputs, _ = select_inputs(request, recording)
+        return recording.sensor_pose(selected, inputs, next(iter(found.frames)))
+
+
+def _judged(
+    request: ReplayRequest,
+    held_out: Sequence[Path],
+    material: Material,
+    stated: Stated,
+    found: Found,
+) -> tuple[Stated, Verdict]:
+    """Judge on what was held out; leave the noise as it was if that is no improvement."""
+    share = 1.0 if held_out else HELD_OUT_SHARE
+
+    def results(settings: Settings, inputs: InputSettings) -> list[Judged]:
+        asked = replace(request, settings=settings, inputs=inputs)
+        judged = [
+            read_material(replace(asked, recording=path), share, material.landmark_map).judged(
+                settings
+            )
+            for path in held_out or [request.recording]
+        ]
+        if not all(len(one.likelihood.stamps_ns) for one in judged):
+            raise UsageError('nothing is seen twice in what is held out')
+        return judged
+
+    before = results(request.settings, request.inputs)
+    after = results(stated.settings, stated.inputs)
+    velocities = (event for event in material.events if isinstance(event, VelocityEvent))
+    noisy = with_noise(stated, found, all(event.covariance is None for event in velocities))
+    after_noise = results(noisy.settings, noisy.inputs)
+    if not judge(after, after_noise).objection:
+        stated, after = noisy, after_noise
+    return stated, judge(before, after)
+
+
+def _print(
+    args: argparse.Namespace,
+    material: Material,
+    found: Found,
+    stated: Stated,
+    verdict: Verdict,
+) -> None:
+    """Print what was found, how well it is known, and how it does on what was held out."""
+    parameters = {name: value for _, values in stated.groups for name, value in values.items()}
+    if args.json:
+        print_json(
+            {
+                'recording': str(args.recording),
+                'recording_sha256': material.sha256,
+                'version': VERSION,
+                'map': None if args.survey is None else str(args.survey),
+                'calibration': {
+                    part.name: asdict(part)
+                    | {'seen': part.deviation / part.stated, 'is_off': is_off(part)}
+                    for part in found.parts
+                },
+                'trades': [asdict(trade) for trade in found.trades],
+                'range_is_depth': found.range_is_depth,
+                'depth_gain': found.depth_gain,
+                'log_likelihood_gain': found.gain,
+                'noise_log_factors': {kind.name: [log, d] for kind, log, d in found.noise},
+                'motion_factors': {part.name: asdict(part) for part in found.factors},
+                'parameters': parameters,
+                'held_out': asdict(verdict),
+            }
+        )
+        return
+    rows = [
+        [part.name, str(part), looked_for(part), f'{100.0 * part.deviation / part.stated:.0f} %']
+        for part in found.parts
+    ]
+    print_columns(str(args.recording), ['', 'found', 'looked for within', 'σ is left'], rows)
+    lines = {'ranges': depth_text(found)}
+    lines |= {f'noise of {kind.name}': certainty(log, d) for kind, log, d in found.noise}
+    lines |= {f'noise of {part.name}': str(part) for part in found.factors}
+    to_do = [*of_mounting(found.parts), *of_noise(found.factors)]
+    lines |= {f'to do: {finding.what}': finding.remedy for finding in to_do}
+    lines |= _open_questions(found)
+    lines['log likelihood, gain'] = '{:.1f} ± {:.1f}'.format(*found.gain)
+    lines |= {f'held out: {name}': text for name, text in verdict_lines(verdict).items()}
+    print_table('what it says', lines)
+
+
+def _open_questions(found: Found) -> dict[str, str]:
+    """Return what the recording says little of, and why."""
+    unseen = [part.name for part in found.parts if not is_seen(part)]
+    lines = {'not seen': f'{", ".join(unseen)}: left as stated'} if unseen else {}
+    if found.too_noisy:
+        lines['too noisy'] = f'velocities for their scale: {", ".join(found.too_noisy)}'
+    for number, trade in enumerate(found.trades, 1):
+        lines[f'trade {number}'] = trade.text
+    return lines
+
+
+def _write(
+    args: argparse.Namespace,
+    given: Given,
+    material: Material,
+    found: Found,
+    stated: Stated,
+    verdict: Verdict,
+) -> None:
+    """Write the parameter file."""
+    held_out = [str(path) for path in args.hold_out] or ['the last third']
+    where = 'the map being made' if args.survey is None else f'the map {args.survey.name}'
+    head = [
+        f'By slam-observer calibrate {VERSION} from',
+        f'  {material.path.name} (SHA-256 {material.sha256}) in {where}',
+        'log likelihood, gain: {:.1f} ± {:.1f}'.format(*found.gain),
+        *judged_lines(held_out, verdict),
+        'Values ± their standard deviations; what the recording says little of is as it was.',
+    ]
+    write_found(args.out, head, given.values, stated.groups)

@@ -1,0 +1,381 @@
+"""What may be wrong, in words: the only place that has them, for table, JSON, report, log and ROS.
+
+``runs/health.py`` judges what is; the estimator's log has what happens on the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+
+
+class Level(IntEnum):
+    """How bad it is; the numbers are those of diagnostic_msgs/DiagnosticStatus."""
+
+    NOTE = 0
+    WARNING = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What is wrong, with names in braces for figures, how bad it is, and what to do."""
+
+    level: Level
+    what: str
+    remedy: str
+
+
+NOISE = 'state more noise (Tune the noise)'
+INPUTS = (
+    'look at the signs, units and frames of the velocity and of the points, then at their noise, '
+    'and in a loaded map whether that is still true'
+)
+
+KINDS = {
+    # What of the inputs was used
+    'nothing_used': Kind(
+        Level.WARNING,
+        'nothing was used, neither a velocity nor an observation (dropped: {dropped})',
+        'see why it was dropped (Troubleshooting)',
+    ),
+    'no_velocity': Kind(
+        Level.WARNING,
+        'no velocity was used (dropped: {dropped}): the landmarks alone move the robot',
+        'see why they were dropped (Troubleshooting)',
+    ),
+    'no_observation': Kind(
+        Level.WARNING,
+        'no observation was used (dropped: {dropped}): the trajectory is that of the velocities '
+        'alone',
+        'see why they were dropped (Troubleshooting)',
+    ),
+    'no_angular_velocity': Kind(
+        Level.WARNING,
+        'no angular velocity of {topic} was used (dropped: {dropped}): that of {instead} was '
+        'taken',
+        'see why they were dropped (Troubleshooting)',
+    ),
+    'unused_input': Kind(
+        Level.ERROR,
+        "none of {count} messages on '{topic}' was used",
+        'see why they are dropped, in the values of this status and in the log',
+    ),
+    'dropped_messages': Kind(
+        Level.WARNING,
+        '{count} dropped ({reasons})',
+        'see what the reasons mean (Troubleshooting), and whose messages they are in the log',
+    ),
+    'paused': Kind(Level.WARNING, 'paused', 'resume it by the service that has paused it'),
+    'silent_input': Kind(
+        Level.WARNING, "no message on '{topic}'", 'see whether its driver has stopped'
+    ),
+    'empty_messages': Kind(
+        Level.WARNING,
+        'no landmark in {count} messages so far',
+        'are there any in view, and is the detector set up for them?',
+    ),
+    # Times of the inputs
+    'silence': Kind(
+        Level.WARNING,
+        'no {input} on {topic} for {silence_s:.1f} s of {duration_s:.1f} s (velocity_timeout): '
+        '{consequence}',
+        'see whether its driver stopped, or messages were lost on the way',
+    ),
+    'landmarks_end': Kind(
+        Level.WARNING,
+        'no landmarks on {topic} for the last {silence_s:.1f} s of {duration_s:.1f} s',
+        'did the detector end?',
+    ),
+    'early_stamps': Kind(
+        Level.WARNING,
+        "stamps of {topic} are {ahead_s:.1f} s ahead of the recorder's clock",
+        'synchronise the clocks',
+    ),
+    'other_clock': Kind(
+        Level.WARNING,
+        'stamps of {topic} are {offset_s:.1f} s {side} those of {other}, by when both were '
+        'received',
+        'synchronise the clocks; a node with correct_clock_offset takes this recording, played '
+        'with --clock, as it is',
+    ),
+    'zero_stamps': Kind(
+        Level.WARNING,
+        'stamps are zero on {topics}; {count} messages have the time of their reception instead',
+        'let their publishers fill in header.stamp',
+    ),
+    'clock_jumped': Kind(
+        Level.WARNING,
+        'trajectory, map, errors and figures are only of the {seconds:.1f} s after the last jump '
+        'of the clock ({count} in all)',
+        'record with one clock, or set on_time_jump: keep',
+    ),
+    # The recording
+    'damaged': Kind(
+        Level.WARNING,
+        '{path}: damaged; {loss}',
+        'record it again if what is lost matters; --strict refuses such recordings',
+    ),
+    'zero_twist': Kind(
+        Level.WARNING,
+        'all velocities on {topic} are zero, but its poses move',
+        'try --velocity-source pose_differences',
+    ),
+    'wrong_twist': Kind(
+        Level.WARNING, 'the twist on {topic} {problem}', 'try --velocity-source pose_differences'
+    ),
+    # The velocity, its calibration and noise
+    'stale_velocity': Kind(
+        Level.WARNING,
+        'no velocity in force: the pose is held',
+        'see whether its driver has stopped, or velocity_timeout is too short for it',
+    ),
+    'late_odometry': Kind(
+        Level.WARNING,
+        'the odometry takes effect {delay_s:.2f} s {when}',
+        'mind it in the driver, or set velocity_delay: {set_to:.2f} (Tune the noise)',
+    ),
+    'implausible_calibration': Kind(
+        Level.WARNING,
+        '{name} is {value:.3g}, {times:.0f} times its stated error ({stated:.3g}) from {nominal}',
+        'are signs, units and frames of velocity and points right?',
+    ),
+    'mounting': Kind(
+        Level.WARNING,
+        '{sensor} is mounted {off} {towards} than /tf says',
+        'add {amount:.4f} to {entry} of its transform or sensor_pose',
+    ),
+    'range_scale': Kind(
+        Level.WARNING,
+        'ranges of {sensor} are to be multiplied by {found}',
+        'set range_scale: {value:.4f}',
+    ),
+    'depth_for_range': Kind(
+        Level.WARNING,
+        'the range looks like {looks}: off the axis it grows with the cosine to the power of '
+        '{power:.2f} ± {deviation:.2f}',
+        'set range_is_depth: {set_to}, or run slam-observer calibrate (Calibrate a sensor)',
+    ),
+    'noisy_odometry': Kind(
+        Level.WARNING,
+        'the odometry is {factor:.1f} × noisier in {motion} than stated',
+        '{proposed}, or let its messages state larger covariances',
+    ),
+    'axis_noise': Kind(
+        Level.NOTE,
+        '{turn_or_way}_velocity_noise and {turn_or_way}_scale_noise of {axis} explain {ratio} × '
+        'less than what is seen of measured {motion} against the truth',
+        'state more (Tune the noise)',
+    ),
+    'motion_noise': Kind(
+        Level.NOTE,
+        'after {gap_s:g} s without landmarks the noise explains {ratio} × less than what is seen',
+        'state more noise of the velocity (Tune the noise)',
+    ),
+    # The points
+    'rejected_points': Kind(
+        Level.WARNING, '{percent:.0f} % of the points {when}were rejected', INPUTS
+    ),
+    'rejected_orientations': Kind(
+        Level.WARNING,
+        'the orientations of {percent:.0f} % of the tags {when}were rejected',
+        'has the map other tag axes than the detector (slam-observer map convert --tag-axes)?',
+    ),
+    'unmapped_points': Kind(
+        Level.WARNING,
+        '{percent:.0f} % of the points are of no landmark of the map',
+        'is it the map of this place{start}?',
+    ),
+    'left_out_points': Kind(
+        Level.WARNING,
+        'of {count} points seen {reasons}',
+        'see under Troubleshooting what these mean; ids are those that the sensor gives',
+    ),
+    'point_noise': Kind(
+        Level.NOTE,
+        'while landmarks are seen the noise explains {ratio} × less than what is seen',
+        'state more noise of the points (Tune the noise)',
+    ),
+    'small_noise': Kind(
+        Level.WARNING,
+        'the stated noise is too small by a factor of {factor:.1f}',
+        'state more noise of the points or of the velocity (Tune the noise)',
+    ),
+    'large_noise': Kind(
+        Level.NOTE,
+        'the stated noise is too large by a factor of {factor:.1f}',
+        'state less noise of the points or of the velocity (Tune the noise)',
+    ),
+    # The pose
+    'error_growth': Kind(
+        Level.NOTE,
+        'the position error grew from {before_m:.2g} to {after_m:.2g} m at {start_s:.0f} to '
+        '{end_s:.0f} s: {circumstances}',
+        'look at the map and the curves at that time',
+    ),
+    'overconfident_pose': Kind(
+        Level.NOTE,
+        'the errors of the pose are {factor:.1f} × as large as its covariance states '
+        '(ANEES {anees:.1f})',
+        NOISE,
+    ),
+    'unknown_pose': Kind(
+        Level.WARNING,
+        'the pose in the loaded map is not known yet: no pose is published',
+        'drive on, or give it on initialpose or by set_initial_pose',
+    ),
+    'ambiguous_pose': Kind(
+        Level.WARNING, '{problem} on initialpose', 'drive on, or give it there'
+    ),
+    'lost_pose': Kind(
+        Level.WARNING,
+        'the pose in the map {path} was lost after {seconds:.1f} s, and not found again: the '
+        'trajectory ends there',
+        'see what was rejected then; was the robot carried out of the map?',
+    ),
+    'slip': Kind(
+        Level.WARNING,
+        'odometry does not explain what is seen: the robot slipped or was carried, or the stated '
+        'noise of its velocity is too small',
+        'if it did not, state more noise of the velocity (Tune the noise)',
+    ),
+    'unexpected_place': Kind(
+        Level.WARNING,
+        'nothing that is seen is where the map has it: if the robot slipped or was carried, '
+        'without ids it is found again in a loaded map only',
+        'give its pose on initialpose, or start again',
+    ),
+    'doubled_landmark': Kind(
+        Level.WARNING,
+        'a landmark without an id was added where a known one should be seen and is not: that one '
+        'was moved, or it is in the map twice now',
+        'if it was not moved, state more noise of the velocity or of the points (Tune the noise)',
+    ),
+    # Events, as they come; the log has how many of each
+    'dropped_message': Kind(
+        Level.WARNING, 'dropped a message, {reason}: {error}', 'see Troubleshooting for the reason'
+    ),
+    'late_velocity': Kind(
+        Level.WARNING,
+        'a velocity came later than reorder_window allows and counts only from then on',
+        'set reorder_window larger if this is frequent',
+    ),
+    'repeated_id': Kind(
+        Level.WARNING,
+        'not used: an observation has several points of the ids {ids}',
+        'give each landmark an id of its own',
+    ),
+    'reserved_id': Kind(
+        Level.WARNING,
+        'not used: points with the ids {ids}; those from {first} to {last} number landmarks '
+        'without an id',
+        'give these others',
+    ),
+    'impossible_id': Kind(
+        Level.WARNING,
+        'not used: {count} points of an observation, whose ids are fractional, below -1, or more '
+        'than their field holds',
+        'look at what the driver writes there; -1 is a point without id',
+    ),
+    'unknown_id': Kind(
+        Level.WARNING,
+        'points without an id are not used by {gains} gains',
+        'only riccati gains use them',
+    ),
+    'many_points': Kind(
+        Level.WARNING,
+        'an observation has {count} points: the time that riccati gains take grows with the cube '
+        'of them, to seconds and a gigabyte for 1000',
+        'let the sensor or its driver send fewer, or use constant gains',
+    ),
+    'unweighed_point': Kind(
+        Level.WARNING,
+        '{count} points in one message, some of them or of the landmarks without an id: the '
+        '{most} with an id or nearest are used',
+        'give ids, or send fewer points',
+    ),
+    'full_map': Kind(
+        Level.WARNING,
+        'the map has {count} landmarks, and max_landmarks is {limit}: from now on a new one '
+        'replaces the one seen least often',
+        'if so many are right, set it higher; if not, look for ids that the sensor makes up',
+    ),
+    'large_map': Kind(
+        Level.WARNING,
+        'the map has {count} landmarks. Where they move, time and memory that riccati gains take '
+        'grow with their square: 70 ms a step and 0.5 GB for 600 landmarks in space',
+        'max_landmarks limits them; landmark_velocity_stddev: 0.0 is for those at rest, of which '
+        'many cost no more than few',
+    ),
+    'loaded_map': Kind(
+        Level.WARNING,
+        'the loaded map has {count} landmarks, and max_landmarks is {limit}: those that are not '
+        'seen make room for new ones',
+        'to keep them, set it higher, or localization_mode: uncertain',
+    ),
+    'left_out_correlations': Kind(
+        Level.WARNING,
+        'correlations between the {count} landmarks of the map are not saved, they are too many',
+        'where it is loaded their errors count as independent: limit it by max_landmarks',
+    ),
+    'more_than_max': Kind(
+        Level.WARNING,
+        '{count} points in one message, and max_landmarks is {limit}',
+        'some are always new; set it higher, or send fewer points',
+    ),
+    'moved_landmark': Kind(
+        Level.WARNING,
+        'landmarks {ids} have moved',
+        'if they have not, state more noise, or look at odometry and ids',
+    ),
+    'carried_landmark': Kind(
+        Level.WARNING,
+        'landmarks {ids} move with the robot, and are not used',
+        'nothing is wrong if it carries them; where they stay behind they are used again',
+    ),
+    'many_moved': Kind(
+        Level.WARNING,
+        '{count} landmarks seem to have moved within a minute: odometry may err by more than is '
+        'stated',
+        'look for a bias or scale that is larger than stated, or not estimated '
+        '(angular_bias_stddev and the like), noise that is set too small, and time without '
+        'messages (unknown_linear_motion, unknown_angular_motion)',
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is, or may be, wrong: what, how bad, since when, and what to do.
+
+    It is of the time from ``start_s`` to ``end_s``, seconds since the run's first event; None
+    where it is of the whole run, or goes on.
+    """
+
+    kind: str
+    level: Level
+    what: str
+    remedy: str
+    start_s: float | None = None
+    end_s: float | None = None
+
+    def text(self, note: str = '') -> str:
+        """Return it as a sentence, with a note behind what is wrong."""
+        what = self.what
+        if not KINDS[self.kind].what.startswith('{'):  # with a name as it is
+            what = what[:1].upper() + what[1:]
+        joint = '; ' if ': ' in what else ': '
+        end = '' if self.remedy.endswith(('?', '.')) else '.'
+        return f'{what}{note}{joint}{self.remedy}{end}'
+
+    def as_json(self) -> dict[str, object]:
+        """Return its parts as ``--json`` has them."""
+        return asdict(self) | {'level': self.level.name.lower()}
+
+
+def found(kind: str, /, **figures: object) -> Finding:
+    """Return a finding of a kind, with its figures in words."""
+    stated = KINDS[kind]
+    return Finding(
+        kind, stated.level, stated.what.format(**figures), stated.remedy.format(**figures)
+    )

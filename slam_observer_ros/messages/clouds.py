@@ -1,0 +1,221 @@
+"""Landmark observations from the bytes of sensor_msgs/PointCloud and PointCloud2.
+
+No Python object is made per point: a cloud of 1000 points costs microseconds, not milliseconds.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.messages.cdr import CdrReader
+from slam_observer_ros.messages.cloud_fields import (
+    CloudField,
+    COVARIANCE_NAMES,
+    FLOAT32_ID_LIMIT,
+    ID_NAME,
+    POINT_FIELD_FLOAT32,
+    POINT_NAMES,
+    read_field,
+    UNKNOWN_UINT32_ID,
+    VELOCITY_NAMES,
+)
+from slam_observer_ros.messages.registry import reads
+
+CLOUDS = ('sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/PointCloud')
+"""Types whose points may have no ids, or be true landmarks."""
+
+MAX_UNKNOWN_POINTS = 500
+"""Most points without id in a message: associating them costs their number cubed."""
+
+_READ_NAMES = frozenset((ID_NAME, *POINT_NAMES, *COVARIANCE_NAMES, *VELOCITY_NAMES))
+_UPPER_TRIANGLE_TO_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+
+_NUMPY_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+
+Records: TypeAlias = NDArray[np.void]
+"""(height, width) structured view of a cloud's data: one record a point."""
+
+
+@reads(CLOUDS[0], role='landmarks')
+def decode_point_cloud2(reader: CdrReader) -> ObservationEvent:
+    """Read a sensor_msgs/PointCloud2 with fields x, y, z and, if it has them, more.
+
+    ``id`` gives the landmark ids, ``UNKNOWN_ID`` where it holds -1 (2³² - 1 if unsigned) or is
+    missing; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per point in the axes of
+    the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s. Points that weren't
+    measured, which are NaN or infinite, are left out, whatever id they have, and whether or not
+    the cloud claims to be dense.
+    """
+    stamp_ns, frame_id = reader.header()
+    height, width = reader.uint32(), reader.uint32()
+    fields = tuple(read_field(reader) for _ in range(reader.uint32()))
+    byte_order = '>' if reader.uint8() else '<'
+    point_step, row_step = reader.uint32(), reader.uint32()
+    data = reader.data(reader.uint32())
+    reader.uint8()  # is_dense, which many publishers set for clouds that are not.
+    if height * width == 0:
+        no_ids = np.zeros(0, dtype=np.int64)
+        return ObservationEvent(stamp_ns, no_ids, np.zeros((0, 3)), sensor_frame=frame_id)
+    _check_size(len(data), height, width, point_step, row_step)
+    dtype = _record_type(fields, byte_order, point_step)
+    strides = (row_step if height > 1 else len(data), point_step)
+    records: Records = np.ndarray((height, width), dtype, data, strides=strides)
+    return _observation(stamp_ns, frame_id, records)
+
+
+@reads(CLOUDS[1], role='landmarks')
+def decode_point_cloud(reader: CdrReader) -> ObservationEvent:
+    """Read a sensor_msgs/PointCloud whose ids, if any, are in the channel ``id``.
+
+    They are ``UNKNOWN_ID`` where the channel holds -1 or is missing, and ``IMPOSSIBLE_ID`` where
+    it holds no whole number that float32 holds exactly; a MessageError is raised if none is one.
+    """
+    stamp_ns, frame_id = reader.header()
+    points = reader.float32(3 * reader.uint32()).reshape(-1, 3)
+    measured = is_measured(points)
+    ids = np.full(len(points), UNKNOWN_ID, dtype=np.int64)
+    for _ in range(reader.uint32()):
+        name = reader.string()
+        values = reader.float32(reader.uint32())
+        if name == ID_NAME:
+            if len(values) != len(points):
+                raise MessageError(f'{len(values)} ids for {len(points)} points')
+            ids[measured] = _ids_from_floats(values[measured], FLOAT32_ID_LIMIT)
+    return ObservationEvent(stamp_ns, ids, points, sensor_frame=frame_id).select(measured)
+
+
+def is_measured(points: FloatArray) -> BoolArray:
+    """Return which points (n, 3) are neither NaN nor infinite: only those were measured."""
+    measured: BoolArray = np.all(np.isfinite(points), axis=1)
+    return measured
+
+
+def scan_problem(event: ObservationEvent) -> str:
+    """Return why a message's observation is a lidar's scan, not landmarks; empty if it isn't."""
+    unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
+    if unknown <= MAX_UNKNOWN_POINTS:
+        return ''
+    return (
+        f'{unknown} points without id in one message, more than {MAX_UNKNOWN_POINTS}: landmarks '
+        'are wanted, a few to a few hundred a message, not scans'
+    )
+
+
+@lru_cache(maxsize=64)
+def _record_type(
+    fields: tuple[CloudField, ...], byte_order: str, point_step: int
+) -> np.dtype[np.void]:
+    """Build the numpy type of one point, with the fields that are read."""
+    formats: dict[str, tuple[str, int]] = {}
+    for field in fields:
+        if field.name not in _READ_NAMES:
+            continue
+        if field.datatype not in _NUMPY_TYPES or field.count > 1:
+            raise MessageError(
+                f'field {field.name} is no single number: datatype {field.datatype}, '
+                f'count {field.count}'
+            )
+        if field.name != ID_NAME and field.datatype < POINT_FIELD_FLOAT32:
+            raise MessageError(f'field {field.name} is not of type FLOAT32 or FLOAT64')
+        numpy_type = byte_order + _NUMPY_TYPES[field.datatype]
+        if field.offset + np.dtype(numpy_type).itemsize > point_step:
+            raise MessageError(f'field {field.name} lies beyond point_step {point_step}')
+        formats[field.name] = (numpy_type, field.offset)
+    _require_whole_groups(set(formats))
+    return np.dtype(
+        {
+            'names': list(formats),
+            'formats': [numpy_type for numpy_type, _ in formats.values()],
+            'offsets': [offset for _, offset in formats.values()],
+            'itemsize': point_step,
+        }
+    )
+
+
+def _require_whole_groups(names: set[str]) -> None:
+    for group, optional in (
+        (POINT_NAMES, False),
+        (COVARIANCE_NAMES, True),
+        (VELOCITY_NAMES, True),
+    ):
+        missing = [name for name in group if name not in names]
+        if missing and not (optional and len(missing) == len(group)):
+            raise MessageError(f'missing field {" ".join(missing)}')
+
+
+def _check_size(size: int, height: int, width: int, point_step: int, row_step: int) -> None:
+    """Refuse rows that overlap, and more points than there are in ``size`` bytes."""
+    if height > 1 and row_step < width * point_step:
+        raise MessageError(f'row_step {row_step} is shorter than {width} points')
+    needed = (height - 1) * row_step + width * point_step
+    if size < needed:
+        raise MessageError(
+            f'data too short: {height} x {width} points need {needed} bytes, not {size}'
+        )
+
+
+def _observation(stamp_ns: int, frame_id: str, records: Records) -> ObservationEvent:
+    points = _columns(records, POINT_NAMES)
+    measured = is_measured(points)
+    if not measured.all():  # The other fields of such points may hold anything.
+        records, points = records[measured.reshape(records.shape)], points[measured]
+    covariances = velocities = None
+    if COVARIANCE_NAMES[0] in _names(records):
+        upper_triangles = _columns(records, COVARIANCE_NAMES)
+        if upper_triangles.any():  # All zeros is how ROS messages say 'unknown'.
+            covariances = upper_triangles[:, _UPPER_TRIANGLE_TO_MATRIX].reshape(-1, 3, 3)
+    if VELOCITY_NAMES[0] in _names(records):
+        velocities = _columns(records, VELOCITY_NAMES)
+    return ObservationEvent(
+        stamp_ns, _ids(records), points, covariances, velocities, sensor_frame=frame_id
+    )
+
+
+def _names(records: Records) -> tuple[str, ...]:
+    return records.dtype.names or ()
+
+
+def _columns(records: Records, names: tuple[str, ...]) -> FloatArray:
+    """Gather fields as (n, len(names)) float64."""
+    columns = np.empty((records.size, len(names)))
+    with np.errstate(invalid='ignore'):  # Any bits may be there, signalling NaNs, too.
+        for index, name in enumerate(names):
+            # A product makes them quiet, which a copy does not.
+            np.multiply(records[name].ravel(), 1.0, out=columns[:, index])
+    return columns
+
+
+def _ids(records: Records) -> IntArray:
+    if ID_NAME not in _names(records):
+        return np.full(records.size, UNKNOWN_ID, dtype=np.int64)
+    values = records[ID_NAME].ravel()
+    if values.dtype.kind == 'f':
+        limit = FLOAT32_ID_LIMIT if values.itemsize == np.float32().itemsize else MAX_ID + 1
+        with np.errstate(invalid='ignore'):
+            return _ids_from_floats(values.astype(np.float64), limit)
+    ids = values.astype(np.int64)
+    ids[ids == UNKNOWN_UINT32_ID] = UNKNOWN_ID
+    possible = ids >= UNKNOWN_ID
+    if ids.size and not possible.any():
+        raise MessageError(f'negative landmark id {ids.min()}; only -1 is allowed, for unknown')
+    return np.where(possible, ids, IMPOSSIBLE_ID)
+
+
+def _ids_from_floats(values: FloatArray, limit: int) -> IntArray:
+    # The comparison is written so that NaN fails it too.
+    exact = (values >= UNKNOWN_ID) & (values < limit) & (values == np.floor(values))
+    if exact.all():
+        return values.astype(np.int64)
+    if not exact.any():  # it is no single mistake, but another quantity
+        raise MessageError(
+            f'landmark id {values[~exact][0]:.10g} in a float channel is not a whole number '
+            f'from -1 to {limit - 1}'
+        )
+    return np.where(exact, np.where(exact, values, 0.0).astype(np.int64), IMPOSSIBLE_ID)

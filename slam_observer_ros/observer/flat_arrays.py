@@ -1,0 +1,101 @@
+"""What the usual step reads and writes, as plain arrays and numbers: one layout in numpy and in C.
+
+Arrays are contiguous, of float64 or int64. Frames and units are those of :mod:`.observer`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+
+
+class Estimate(NamedTuple):
+    """X̂ and the covariance P of its errors (ε, c̃, ξ_1 … ξ_n), of a map of points at rest."""
+
+    A: FloatArray  # (4, 4) Â
+    y_ref: FloatArray  # (n, 3) y_i°
+    a: FloatArray  # (n, 3) â_i, changed in place
+    P: FloatArray  # (room, room) of which the first N rows and columns count, changed in place
+    size: int  # N
+    first: int  # p + c, the first column of the landmarks
+    is_planar: bool  # whether p is 3 and k is 2, in place of 6 and 3
+    calibration: FloatArray  # (13,) 1 + s, b, and τ of velocities
+    estimated: IntArray  # (c_v,) which of these c̃ begins with; scales, biases, delay
+    drift: FloatArray  # (c, c) what a second adds to the covariance of c̃
+
+
+class Interval(NamedTuple):
+    """The time of a motion, and how its velocity began."""
+
+    start_ns: int
+    end_ns: int
+    delay_ns: int  # how much earlier the velocities were
+    reach_ns: int  # how far the delay may be off, 0 where it is not estimated
+    # (6,) mean velocity about the start, as the motion before has it about its end
+    at_start: FloatArray | None
+
+
+class Advanced(NamedTuple):
+    """What a motion did, written by :func:`.advance`."""
+
+    A: FloatArray  # (4, 4) Â at its end
+    noise: FloatArray  # (p, p) what it added to the covariance of ε
+    of_turning: FloatArray  # (p, p) which part of that grows with the factor of turning
+    sensitivity: FloatArray  # (p, c) F, how ε grows with the errors of the calibration
+    at_end: FloatArray  # (6,) mean velocity about the end
+    variances: FloatArray  # (6,) of the motion by axis, body frame, rad² and m²
+
+
+class Landmarks(NamedTuple):
+    """What is known of each of n landmarks, changed in place."""
+
+    sorted_ids: IntArray  # (n,)
+    order: IntArray  # (n,) which landmark each of these is
+    counts: IntArray  # (n,) as in :class:`.LandmarkTable`, and so the others
+    rejections: IntArray
+    last_seen_ns: IntArray
+    seen_before_ns: IntArray
+
+
+class Seen(NamedTuple):
+    """Points seen, body frame, and the sensor that saw them, if it is calibrated."""
+
+    stamp_ns: int
+    ids: IntArray  # (m,)
+    arms: FloatArray  # (m, 3) from the sensor to each point, metres
+    origins: FloatArray | None  # (m, 3) where the sensor was, metres; None at the base
+    covariances: FloatArray | None  # (m, 3, 3) as stated, m²; None for those of the figures
+    sensor: FloatArray | None  # (7,) ψ, d and s of the sensor, rad and m
+    of_sensor: IntArray  # (c_s,) which of these are estimated
+    column: int  # of c̃ where these begin
+
+
+class Limits(NamedTuple):
+    """How far an observation is trusted."""
+
+    gate: float  # standard deviations
+    huber: float  # the same, 0 for none
+    error_time_s: float  # correlation time of the errors of points
+    confirmations: int  # observations that make a landmark sure
+    max_rejections: int  # in a row, which make it doubtful
+    weighs_meanings: bool  # whether a point that its id explains badly may be something else
+
+
+class Observed(NamedTuple):
+    """What an observation did, written by :func:`.observe`."""
+
+    A: FloatArray  # (4, 4) Â after it
+    rows: IntArray  # (m,) which landmarks were seen
+    points: FloatArray  # (m, 3) where, by the calibration of the sensor, body frame
+    r: FloatArray  # (m, 3) residuals (29)
+    weights: FloatArray  # (m,) Huber's
+    origins: FloatArray  # (m, 3) where the sensor was, body frame
+    lines_of_sight: FloatArray  # (m, 3) from the sensor to where each should be now
+    # (m, 3, 3) of the points, body frame, m²; (0, 3, 3) where none were stated
+    covariances: FloatArray
+    dt_s: FloatArray  # (m,) since each was seen before; infinite if it was not
+    shift: FloatArray  # (c,) by how much the calibration is to be moved
+    # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
+    # normalised innovation squared of all; empty where nobody asks
+    judged: FloatArray

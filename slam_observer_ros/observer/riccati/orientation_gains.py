@@ -1,0 +1,149 @@
+"""Riccati gains of landmarks that may have orientations, as tags do.
+
+The orientations seen correct it by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the coordinates of
+:mod:`.chart` that is H x with a constant H, too. Then the points do, as ever. Both noises
+are taken to be independent, so to first order that is the same as both at once. Covariances
+(m, 3, 3) are those of rotation vectors, rad².
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.orientations import (
+    flip_verdicts,
+    SeenOrientations,
+)
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.robust import distances, observation_weights
+from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
+
+
+class OrientationGains(Filter):
+    """What a filter with a joint covariance does with orientations, if it estimates them."""
+
+    joint: JointCovariance
+
+    def _move(self, x: FloatArray) -> None:
+        """Move the state by exp(x)."""
+        raise NotImplementedError
+
+    def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
+        """Move the state by what is seen of known orientations.
+
+        Return the weight (m,) of each, and which of them are left out as they, and their flipped
+        twins, are both likely.
+        """
+        phi, R = self._turns(seen.rows, seen.Z), self._noise(seen.covariances)
+        _, predicted = self.joint.project_turns(seen.rows, seen.D)
+        # Which of the two that look alike it is; a gate; then Huber's weights.
+        are_flipped, are_unclear = self._judge_flips(seen, phi, predicted, R)
+        kept = ~(are_flipped | are_unclear)
+        entries = np.flatnonzero(np.repeat(kept, phi.shape[1]))
+        weights = np.zeros(len(phi))
+        weights[kept] = observation_weights(
+            phi[kept], predicted[np.ix_(entries, entries)], R[kept], self._settings
+        )
+        # K = P Hᵀ S⁻¹, X̂ ← exp(−K φ) · X̂
+        used = weights > 0.0
+        if used.any():
+            repeated = repetition_factors(
+                seen.dt_s[used], self._settings.observation_correlation_time
+            )
+            HP, HPH = self.joint.project_turns(seen.rows[used], seen.D)
+            S = with_blocks(HPH, R[used] / (weights[used] / repeated)[:, None, None])
+            self._move(-self.joint.update(HP, S, phi[used].ravel()))
+        return weights, are_unclear
+
+    def add_orientations(self, seen: SeenOrientations) -> None:
+        """Take over orientations as they are seen, for those of which nothing is known."""
+        self.orientations.put(seen.rows, self.observer.A[:3, :3] @ seen.Z)
+        self.joint.add_turns(seen.rows, self._noise(seen.covariances), seen.D)
+
+    def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
+        """Take in orientations of a map, whose errors are independent of all else."""
+        own = self.orientations.are_known[rows] & (not self.is_exact)
+        new, seen = ~own, self._settings.max_rejections
+        self.orientations.put_known(rows[new], B[new], sigmas[new], seen)
+        if self.is_exact:
+            return
+        variances = np.maximum(sigmas, RESOLUTION_RAD)[:, None, None] ** 2
+        R = variances * np.eye(self.axes.turn)
+        self.joint.add_known_turns(rows[new], R[new])
+        # Of those that both have, B̂_i B_iᵀ = exp(ω_i), unless they contradict each other.
+        known, R = rows[own], R[own]
+        omega = self.axes.turns(so3.log(self.orientations.B[known] @ transpose(B[own])))
+        near = mahalanobis(omega, self.joint.own_turns(known) + R)
+        agree = near <= self._settings.rejection_threshold
+        if agree.any():
+            self.joint.activate(known[agree])
+            HP, HPH = self.joint.project_own_turns(known[agree])
+            S = with_blocks(HPH, R[agree])
+            self._move(-self.joint.update(HP, S, omega[agree].ravel()))
+
+    def orientation_matrices(self, rows: IntArray) -> FloatArray:
+        """Return B̂_i (m, 3, 3) of landmarks, zero for those that have none."""
+        return self.joint.turned(rows, self.orientations.B[rows])
+
+    def orientation_sigmas(self, rows: IntArray) -> FloatArray:
+        """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
+        if self.is_exact:
+            return self.orientations.map_sigmas[rows]
+        largest = np.linalg.eigvalsh(self.joint.own_turns(rows))[:, -1]
+        return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
+
+    def _turns(self, rows: IntArray, Z: FloatArray) -> FloatArray:
+        """Return φ_i (m, q), rad, of orientations ``Z`` (m, 3, 3) seen, body frame."""
+        R_hat = self.observer.A[:3, :3]
+        return self.axes.turns(so3.log(R_hat @ Z @ transpose(self.orientations.B[rows])))
+
+    def _noise(self, covariances: FloatArray) -> FloatArray:
+        """Return covariances of the body frame (m, q, q) along the reference frame's axes."""
+        return self.axes.turn_covariances(self.observer.turned(covariances))
+
+    def _judge_flips(
+        self, seen: SeenOrientations, phi: FloatArray, predicted: FloatArray, R: FloatArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Return which (m,) are flipped, and of which that is unclear."""
+        twins = self._turns(seen.rows, seen.flipped)
+        evidence = distances(twins, predicted, R) ** 2 - distances(phi, predicted, R) ** 2
+        R_hat = self.observer.A[:3, :3]
+        apart = self.axes.turns(so3.log(R_hat @ seen.Z @ transpose(R_hat @ seen.flipped)))
+        return flip_verdicts(evidence, distances(apart, np.zeros_like(predicted), R))
+
+    def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
+        """Take in what a map knows of the orientations of landmarks ``rows`` (m,)."""
+        tags, R, sigmas = known.tags, known.orientations, known.sigmas
+        if R is None or sigmas is None or not self.estimates_orientations:
+            return
+        if known.joint is None:
+            self.know_orientations(rows[tags], R[tags], sigmas[tags])
+        else:  # their errors have been taken in with those of the positions
+            seen = self._settings.max_rejections
+            self.orientations.put_known(rows[tags], R[tags], sigmas[tags], seen)
+
+    def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
+        tags = self.orientations
+        in_map, own = tags.are_known[copies], tags.are_known[rows]
+        if not in_map.any():
+            return
+        # Those of which only the map knows, …
+        new, of_new = rows[in_map & ~own], copies[in_map & ~own]
+        self.joint.copy_turns(of_new, new)
+        seen = self._settings.max_rejections
+        tags.put_known(new, tags.B[of_new], tags.map_sigmas[of_new], seen)
+        # … and those that both have, B̂_i B̂_jᵀ = exp(ω_i − ω_j), unless they are contradictory.
+        rows, copies = rows[in_map & own], copies[in_map & own]
+        omega = self.axes.turns(so3.log(tags.B[rows] @ transpose(tags.B[copies])))
+        R = RESOLUTION_RAD**2 * np.tile(np.eye(self.axes.turn), (len(rows), 1, 1))
+        near = distances(omega, self.joint.project_turn_differences(rows, copies)[1], R)
+        agree = near <= self._settings.rejection_threshold
+        if agree.any():
+            HP, HPH = self.joint.project_turn_differences(rows[agree], copies[agree])
+            S = with_blocks(HPH, R[agree])
+            self._move(-self.joint.update(HP, S, omega[agree].ravel()))

@@ -1,0 +1,513 @@
+"""The usual step in numpy: the reference that ``_core.c`` repeats, equation by equation.
+
+A motion along velocities without a gap, and an observation whose points are all of known
+landmarks, none of them in doubt. Anything else is UNUSUAL, and nothing is changed then: the
+filters' own methods go on from there.
+
+The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, see :mod:`.riccati.joint_covariance`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg.blas import dtrsm, dtrsv
+from scipy.linalg.lapack import dpotrf, dpotrs
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.geometry import se3, slam_group, so3
+from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
+from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, with_blocks
+from slam_observer_ros.geometry.sensor_mounting import sensitivity as sensor_sensitivity
+from slam_observer_ros.observer.flat_arrays import (
+    Advanced,
+    Estimate,
+    Interval,
+    Landmarks,
+    Limits,
+    Observed,
+    Seen,
+)
+from slam_observer_ros.observer.riccati.symmetric_matrix import (
+    add_symmetric_product,
+    subtract_square,
+)
+from slam_observer_ros.observer.robust import (
+    are_far,
+    far_from_the_others,
+    huber_weights,
+    REWEIGHTINGS,
+)
+from slam_observer_ros.sensor_models.motion_noise import (
+    Factors,
+    learnt,
+    MotionFigures,
+    score,
+    SPEED_WINDOW_S,
+)
+from slam_observer_ros.sensor_models.observation_noise import (
+    point_covariances,
+    PointFigures,
+    repetition_factors,
+    RESOLUTION_M,
+    stated_covariances,
+)
+from slam_observer_ros.sensor_models.velocity_history import Velocities
+
+UNUSUAL, AT_REST, DONE = -1, 0, 1
+"""What a step returns; AT_REST where the motion says nothing of the noise of velocities."""
+
+_TINY = np.finfo(np.float64).tiny
+_PLANAR = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
+LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+# A motion: (27)
+
+
+def advance(
+    x: Estimate,
+    velocities: Velocities,
+    interval: Interval,
+    figures: MotionFigures,
+    out: Advanced,
+) -> int:
+    """Move X̂ along velocities (27), with what that does to P."""
+    pieces = _pieces(velocities, interval, x.is_planar)
+    if pieces is None:
+        return UNUSUAL
+    V, dt_s, before_s = pieces
+    axes, (p, c) = axes_of(x.is_planar), out.sensitivity.shape
+    # (27)  Â ← Â exp(V dt), V = (1 + s) ∘ V_measured + b
+    path = se3.path(x.A, _calibrated(x, V) * dt_s[:, None])
+    out.A[:] = path[-1]
+    out.A[:3, :3] = so3.normalise(path[-1, :3, :3])
+    # ε ← ε + F c̃ + w,  w ~ N(0, Σ Ad_Â Q Ad_Âᵀ)
+    Ad = se3.adjoint(path)[:, axes.pose]
+    Q = _variances(V, dt_s, before_s, velocities, interval, figures)
+    out.variances[:] = Q.sum(axis=0)
+    _summed_noise(Ad, se3.at_poses(Q), out)
+    F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
+    # x ← x + J (F c̃ + w), and ξ_i ← ξ_i + [ŷ_i]× ε_Ω of what is added to ε
+    P, of_c = x.P, slice(p, x.first)
+    JT = np.zeros((p, len(P)))
+    JT[:, :p] = np.eye(p)
+    JT[:, x.first : x.size] = -axes.turn_matrix(x.y_ref + x.a).reshape(-1, p).T
+    half = (0.5 * (out.noise + F.dot(P[of_c, of_c]).dot(F.T))).dot(JT)
+    if c:
+        half += F.dot(P[of_c])
+    add_symmetric_product(P, x.size, JT, half)
+    P[of_c, of_c] += x.drift * to_s(interval.end_ns - interval.start_ns)
+    return DONE if V.any() and dt_s.all() else AT_REST
+
+
+def _pieces(
+    velocities: Velocities, interval: Interval, is_planar: bool
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return velocities (k, 6), for how long each is held, and (k, 2) was before; None for gaps.
+
+    None, too, where some of them come with covariances of their own.
+    """
+    start_ns, end_ns = interval.start_ns - interval.delay_ns, interval.end_ns - interval.delay_ns
+    first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
+    last = int(velocities.stamps_ns.searchsorted(end_ns, 'left'))
+    bounds_ns = np.append(velocities.stamps_ns[first:last], end_ns)
+    if last <= first or velocities.is_stated[first:last].any():
+        return None
+    bounds_ns[0], since_ns = start_ns, velocities.since_ns[first:last]
+    if (since_ns[:, 1] + velocities.timeout_ns < bounds_ns[1:]).any():
+        return None
+    V = _counting(velocities.body_velocities[first:last], is_planar)
+    return V, to_s(np.diff(bounds_ns)), to_s(bounds_ns[:-1, None] - since_ns)
+
+
+def _counting(V: FloatArray, is_planar: bool) -> FloatArray:
+    """Return what counts of velocities (…, 6)."""
+    return V * _PLANAR if is_planar else V
+
+
+def _calibrated(x: Estimate, V: FloatArray) -> FloatArray:
+    """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so."""
+    return V * x.calibration[:6] + np.asarray(V.any(axis=-1))[..., None] * x.calibration[6:12]
+
+
+def _variances(
+    V: FloatArray,
+    dt_s: FloatArray,
+    before_s: FloatArray,
+    velocities: Velocities,
+    interval: Interval,
+    figures: MotionFigures,
+) -> FloatArray:
+    """Return the variances (k, 6) of what each velocity moves the robot by."""
+    # White noise: held longer than usual, one error has moved the robot by so much more.
+    usual_s = np.array(velocities.usual_s) + max(to_s(-interval.delay_ns), 0.0)
+    until_s = before_s + dt_s[:, None]
+    white_s: FloatArray = dt_s[:, None]
+    if np.count_nonzero(until_s > usual_s):
+        grown_s = until_s * np.maximum(until_s / usual_s, 1.0)
+        grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
+        white_s = grown_s.repeat(3, axis=1)
+    Q = figures.densities * white_s
+    if np.count_nonzero(figures.scales):
+        Q += (figures.scales * _averaged(V, dt_s)) ** 2 * dt_s[:, None]
+    return Q * figures.factors.repeat(3)
+
+
+def _averaged(V: FloatArray, dt_s: FloatArray) -> FloatArray:
+    """Return the mean velocities (k, 6) over a window around the middle of each."""
+    times_s = np.append(0.0, np.cumsum(dt_s))
+    motions = np.zeros((len(times_s), 6))
+    np.cumsum(dt_s[:, None] * V, axis=0, out=motions[1:])
+    middles_s, numbers = 0.5 * (times_s[:-1] + times_s[1:]), np.arange(len(dt_s))
+    starts = np.minimum(times_s.searchsorted(middles_s - 0.5 * SPEED_WINDOW_S), numbers)
+    ends = times_s.searchsorted(middles_s + 0.5 * SPEED_WINDOW_S, side='right') - 1
+    ends = np.maximum(ends, numbers + 1)
+    lengths_s = np.maximum(times_s[ends] - times_s[starts], _TINY)
+    means: FloatArray = (motions[ends] - motions[starts]) / lengths_s[:, None]
+    return means
+
+
+def _summed_noise(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
+    """Write Σ Ad_Â Q Ad_Âᵀ by the trapezoidal rule, ``shares`` (k + 1, 6) of Q at the poses."""
+    p = len(out.noise)
+    flat = Ad.swapaxes(0, 1).reshape(p, -1)
+    out.noise[:] = (flat * shares.ravel()).dot(flat.T)
+    shares[:, 3:] = 0.0
+    out.of_turning[:] = (flat * shares.ravel()).dot(flat.T)
+
+
+def _sensitivity(
+    x: Estimate,
+    Ad: FloatArray,
+    V: FloatArray,
+    dt_s: FloatArray,
+    velocities: Velocities,
+    interval: Interval,
+    out: Advanced,
+) -> FloatArray:
+    """Write F (p, c): ε' = Ad_Â (V ∘ s̃ + b̃), and of a delay what its two ends differ by."""
+    F = out.sensitivity
+    F[:] = 0.0
+    of_rates = x.estimated[x.estimated < 12]
+    if len(of_rates):
+        columns, are_biases = of_rates % 6, of_rates >= 6
+        rates = np.where(are_biases, V.any(axis=1, keepdims=True), V[:, columns])
+        shares = se3.at_poses(rates * dt_s[:, None])
+        F[:, : len(columns)] = (Ad[:, :, columns] * shares[:, None, :]).sum(axis=0)
+    if interval.reach_ns:
+        at_start = interval.at_start
+        if at_start is None:
+            at_start = _mean_about(interval.start_ns, velocities, interval, x.is_planar)
+        out.at_end[:] = _mean_about(interval.end_ns, velocities, interval, x.is_planar)
+        before, after = _calibrated(x, at_start), _calibrated(x, out.at_end)
+        F[:, len(x.estimated) - 1] = Ad[0].dot(before) - Ad[-1].dot(after)
+    return F
+
+
+def _mean_about(
+    stamp_ns: int, velocities: Velocities, interval: Interval, is_planar: bool
+) -> FloatArray:
+    """Return the mean velocity (6,) about a stamp, as far as its delay may reach."""
+    centre_ns = stamp_ns - interval.delay_ns
+    start_ns, end_ns = centre_ns - interval.reach_ns, centre_ns + interval.reach_ns
+    first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
+    last = int(velocities.stamps_ns.searchsorted(end_ns, 'left'))
+    stamps_ns = np.append(velocities.stamps_ns[first:last], end_ns)
+    begins_ns = np.maximum(stamps_ns[:-1], start_ns)
+    timed_out_ns = velocities.since_ns[first:last, 1] + velocities.timeout_ns
+    held_s = to_s(np.minimum(np.maximum(timed_out_ns, begins_ns), stamps_ns[1:]) - begins_ns)
+    known_s = held_s.sum()
+    if not known_s:
+        return np.zeros(6)
+    return _counting(held_s.dot(velocities.body_velocities[first:last]) / known_s, is_planar)
+
+
+# An observation: (28) to (31)
+
+
+class _Residuals(NamedTuple):
+    """What m points say against the state, in the reference frame, on k estimated axes."""
+
+    rows: IntArray  # (m,) which landmarks are seen
+    columns: IntArray  # (m k,) theirs in P
+    points: FloatArray  # (m, 3) ŷ_i
+    r: FloatArray  # (m, 3) r_i (29)
+    R: FloatArray  # (m, k, k) covariances of the points seen
+    stated: FloatArray | None  # (m, 3, 3) the same in the body frame, where it was stated
+    D: FloatArray | None  # (m, k, c) how r_i changes with the calibration; None if it does not
+    repeated: FloatArray  # (m,) by how much R grows, as errors last
+    axes: EstimatedAxes
+
+    @property
+    def flat(self) -> FloatArray:
+        """(m k,) all residuals."""
+        return self.r[:, : self.axes.point].ravel()
+
+    def output_matrix(self, chord: float) -> FloatArray:
+        """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, at ``chord`` from ŷ_i to the point seen."""
+        C = self.axes.output_matrix(chord * self.r)
+        C = C if self.D is None else np.concatenate([C, self.D], axis=2)
+        return C.reshape(len(self.columns), -1)
+
+
+class _Judged(NamedTuple):
+    """What P predicts of residuals, and how far they are off by that."""
+
+    predicted: FloatArray  # (m k, m k) C P Cᵀ
+    S: FloatArray  # (m k, m k) with the noise of the points
+    L: FloatArray  # (m k, m k) L Lᵀ = S
+    S_inv_r: FloatArray  # (m k,)
+
+
+def observe(
+    x: Estimate,
+    landmarks: Landmarks,
+    seen: Seen,
+    figures: PointFigures,
+    limits: Limits,
+    factors: Factors | None,
+    out: Observed,
+) -> int:
+    """Move X̂ by the innovation (28)–(31), and P with it.
+
+    Without ``factors`` nothing is learnt of the noise of the motion.
+    """
+    residuals = _residuals(x, landmarks, seen, figures, limits, out)
+    judged = None if residuals is None else _judged(x, residuals, limits)
+    if residuals is None or judged is None:
+        return UNUSUAL
+    learnt = None if factors is None else _learnt(factors, residuals, judged.S, limits.gate)
+    if factors is not None and learnt is None:
+        return UNUSUAL
+    weights = _weights(residuals, judged, limits)
+    dx = None if weights is None else _correct(x, residuals, weights)
+    if weights is None or dx is None:
+        return UNUSUAL
+    # (28)  X̂ ← exp(−K r) · X̂:  Â ← exp(ε) Â,  ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i
+    axes = residuals.axes
+    X = slam_group.exp(axes.full_pose(dx[: axes.p]), axes.full_points(dx[x.first :]))
+    R_D = X.A[:3, :3]
+    out.A[:] = X.A.dot(x.A)
+    x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))
+    out.shift[:] = dx[axes.p : x.first]
+    out.weights[:] = weights
+    if factors is not None and learnt is not None:
+        factors.information[:], factors.logs[:] = learnt
+        if factors.least < math.inf:
+            factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
+    if len(out.judged):
+        _write_judged(residuals, judged, out.judged)
+    _record(x, landmarks, seen, limits, out)
+    if residuals.stated is not None:
+        out.covariances[:] = stated_covariances(
+            out.points, residuals.stated, out.lines_of_sight, figures
+        )
+    return DONE
+
+
+def _residuals(
+    x: Estimate,
+    landmarks: Landmarks,
+    seen: Seen,
+    figures: PointFigures,
+    limits: Limits,
+    out: Observed,
+) -> _Residuals | None:
+    """Return the residuals (29); None where a landmark is new or in doubt."""
+    at = landmarks.sorted_ids.searchsorted(seen.ids)
+    rows = landmarks.order.take(at, mode='clip')
+    if np.count_nonzero(landmarks.sorted_ids.take(at, mode='clip') == seen.ids) < len(at):
+        return None
+    counts, rejections = landmarks.counts.take(rows), landmarks.rejections.take(rows)
+    if np.count_nonzero(rejections >= np.minimum(counts + 1, limits.max_rejections)):
+        return None
+    axes, R_hat, x_hat = axes_of(x.is_planar), x.A[:3, :3], x.A[:3, 3]
+    k = axes.point
+    y, origins, stated = _corrected(seen, x.is_planar)
+    points = x.y_ref.take(rows, axis=0) + x.a.take(rows, axis=0)
+    # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
+    r = y.dot(R_hat.T) + x_hat - points
+    # The noise at the range where a landmark should be, in the measured direction.
+    expected = (points - x_hat).dot(R_hat)
+    is_sure = counts >= limits.confirmations
+    ranges_2 = _squares(np.where(is_sure[:, None], expected, y) - origins)
+    stretch = np.sqrt(ranges_2 / np.maximum(_squares(y - origins), RESOLUTION_M**2))
+    towards = stretch[:, None] * (y - origins)
+    covariances = (
+        point_covariances(towards, figures)
+        if stated is None
+        else stated_covariances(y, stated, towards, figures)
+    )
+    # How r_i changes with the sensor that saw the point.
+    D = None
+    if seen.sensor is not None and len(seen.of_sensor):
+        D = np.zeros((len(r), k, x.first - axes.p))
+        of_sensor = sensor_sensitivity(seen.sensor, expected - origins)[:, :, seen.of_sensor]
+        D[:, :, seen.column : seen.column + len(seen.of_sensor)] = (R_hat @ of_sensor)[:, :k]
+    out.rows[:], out.points[:], out.r[:], out.origins[:] = rows, y, r, origins
+    out.dt_s[:] = dt_s = _unseen_s(landmarks, rows, seen.stamp_ns)
+    return _Residuals(
+        rows,
+        (x.first + np.arange(k) + k * rows[:, None]).ravel(),
+        points,
+        r,
+        (R_hat @ covariances @ R_hat.T)[:, :k, :k],
+        stated,
+        D,
+        repetition_factors(dt_s, limits.error_time_s),
+        axes,
+    )
+
+
+def _corrected(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return points y (m, 3) by the calibration of their sensor, and where that was (m, 3).
+
+    And their covariances (m, 3, 3) where these are stated.
+    """
+    origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
+    if seen.sensor is None:
+        return seen.arms + origins, origins, seen.covariances
+    # y = o + d + exp(ψ) e^s p
+    origins = origins + seen.sensor[3:6]
+    turn = math.exp(seen.sensor[6]) * so3.exp(seen.sensor[:3])
+    y = seen.arms.dot(turn.T) + origins
+    stated = None if seen.covariances is None else turn @ seen.covariances @ turn.T
+    if is_planar:  # the line of sight keeps its height
+        origins[:, 2] -= y[:, 2]
+        y[:, 2] = 0.0
+    return y, origins, stated
+
+
+def _unseen_s(landmarks: Landmarks, rows: IntArray, stamp_ns: int) -> FloatArray:
+    """Return how long landmarks (m,) have not been seen, seconds; by another sensor just now."""
+    last_ns = landmarks.last_seen_ns.take(rows)
+    last_ns = np.where(last_ns == stamp_ns, landmarks.seen_before_ns.take(rows), last_ns)
+    return np.where(last_ns < 0, np.inf, to_s(stamp_ns - last_ns))
+
+
+def _judged(x: Estimate, residuals: _Residuals, limits: Limits) -> _Judged | None:
+    """Return S = C P Cᵀ + R, factored; None where a point is rejected, or may be something else.
+
+    C is taken in the middle between ŷ_i and the point seen: turning moves at right angles to it.
+    """
+    C, P, axes = residuals.output_matrix(0.5), x.P, residuals.axes
+    q = C.shape[1]
+    seen_P = P.take(residuals.columns, axis=0)
+    to_state = seen_P[:, :q]
+    predicted = C.dot(P[:q, :q].dot(C.T) - to_state.T) - to_state.dot(C.T)
+    predicted += seen_P.take(residuals.columns, axis=1)
+    S = with_blocks(predicted, residuals.R)
+    L, is_indefinite = dpotrf(S, lower=1)
+    if is_indefinite:
+        return None
+    S_inv_r = dpotrs(L, residuals.flat, lower=1)[0]
+    r = residuals.r[:, : axes.point]
+    # No residual is further out than all of them together are.
+    if residuals.flat.dot(S_inv_r) > limits.gate**2:
+        distances = mahalanobis(r, diagonal_blocks(S, axes.point))
+        if np.count_nonzero(distances > limits.gate):
+            return None
+    if limits.weighs_meanings:
+        far = are_far(mahalanobis(r, residuals.R), limits.gate)
+        if far.any() and (far & far_from_the_others(r, predicted, residuals.R, limits.gate)).any():
+            return None
+    return _Judged(predicted, S, L, S_inv_r)
+
+
+def _learnt(
+    factors: Factors, residuals: _Residuals, S: FloatArray, gate: float
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return F̄ (2, 2) and θ (2,) by these residuals, too; None if some are to be left out."""
+    axes, r = residuals.axes, residuals.r
+    C = axes.output_matrix(residuals.points + 0.5 * r).reshape(-1, axes.p)
+    # As the likelihood at θ has it, which may be less than is applied.
+    ratios = np.exp(factors.logs) / factors.applied
+    N = ratios[:, None, None] * factors.shares
+    if np.count_nonzero(ratios != 1.0):
+        S = S + C.dot((N - factors.shares).sum(axis=0)).dot(C.T)
+    L, is_indefinite = dpotrf(S, lower=1)
+    if is_indefinite:
+        return None
+    solved = dpotrs(L, np.column_stack([residuals.flat, C]), lower=1)[0]
+    squared = float(residuals.flat.dot(solved[:, 0]))
+    if squared > gate**2:
+        passed = np.count_nonzero(
+            mahalanobis(r[:, : axes.point], diagonal_blocks(S, axes.point)) <= gate
+        )
+        if len(r) < 2 * passed < 2 * len(r):
+            return None
+    u, G = C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:])
+    return learnt(factors.logs, factors.information, *score(u, G, N, squared, len(solved)))
+
+
+def _weights(residuals: _Residuals, judged: _Judged, limits: Limits) -> FloatArray | None:
+    """Return Huber's weights (m,) of what the correction leaves of the residuals, R S⁻¹ r."""
+    R, (m, k, _) = residuals.R, residuals.R.shape
+    weights = huber_weights(judged.S_inv_r.reshape(m, k), R, np.ones(m), limits.huber)
+    for _ in range(REWEIGHTINGS - 1):
+        if np.count_nonzero(weights == 1.0) == m:
+            break
+        S = with_blocks(judged.predicted, R / weights[:, None, None])
+        L, is_indefinite = dpotrf(S, lower=1)
+        if is_indefinite:
+            return None
+        S_inv_r = dpotrs(L, residuals.flat, lower=1)[0]
+        weights = huber_weights(S_inv_r.reshape(m, k), R, weights, limits.huber)
+    return weights
+
+
+def _correct(x: Estimate, residuals: _Residuals, weights: FloatArray) -> FloatArray | None:
+    """Return −K r, K = P Hᵀ S⁻¹ (30), (31), and let P become P − K H P; None if S is indefinite.
+
+    H takes C at ŷ_i: so no observation says anything of the gauge.
+    """
+    C, P, columns = residuals.output_matrix(0.0), x.P, residuals.columns
+    q = C.shape[1]
+    HP = C.dot(P[:q]) - P.take(columns, axis=0)
+    HPH = HP[:, :q].dot(C.T) - HP.take(columns, axis=1)
+    S = with_blocks(HPH, residuals.R * (residuals.repeated / weights)[:, None, None])
+    L, is_indefinite = dpotrf(S, lower=1)
+    if is_indefinite:
+        return None
+    # W = L⁻¹ H P:  P − Wᵀ W,  K r = Wᵀ L⁻¹ r
+    W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+    subtract_square(P, x.size, W)
+    dx: FloatArray = -dtrsv(L, residuals.flat, lower=1).dot(W[:, : x.size])
+    return dx
+
+
+def _write_judged(residuals: _Residuals, judged: _Judged, out: FloatArray) -> None:
+    """Write how far off each residual was, its density given those before it, shares and NIS."""
+    k, m = residuals.axes.point, len(residuals.r)
+    distances, densities, shares = out[: 3 * m].reshape(3, m)
+    distances[:] = mahalanobis(residuals.r[:, :k], diagonal_blocks(judged.S, k))
+    white = dtrsv(judged.L, residuals.flat, lower=1)
+    each = 0.5 * white**2 + np.log(np.diagonal(judged.L)) + LOG_ROOT_2_PI
+    densities[:] = -each.reshape(m, k).sum(axis=1)
+    shares[:] = 1.0 / residuals.repeated
+    out[3 * m] = white.dot(white)
+
+
+def _record(x: Estimate, landmarks: Landmarks, seen: Seen, limits: Limits, out: Observed) -> None:
+    """Note that landmarks were seen, and where they should have been by the corrected state."""
+    rows = out.rows
+    landmarks.counts[rows] += 1
+    landmarks.rejections[rows] = 0
+    last_ns = landmarks.last_seen_ns.take(rows)
+    is_later = last_ns < seen.stamp_ns
+    landmarks.seen_before_ns[rows[is_later]] = last_ns[is_later]
+    landmarks.last_seen_ns[rows[is_later]] = seen.stamp_ns
+    points = x.y_ref.take(rows, axis=0) + x.a.take(rows, axis=0)
+    expected = (points - out.A[:3, 3]).dot(out.A[:3, :3])
+    is_sure = landmarks.counts.take(rows) >= limits.confirmations
+    out.lines_of_sight[:] = np.where(is_sure[:, None], expected, out.points) - out.origins
+
+
+def _squares(vectors: FloatArray) -> FloatArray:
+    """Return the squared lengths (m,) of vectors (m, 3)."""
+    squares: FloatArray = np.einsum('ij,ij->i', vectors, vectors)
+    return squares

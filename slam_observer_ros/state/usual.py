@@ -1,0 +1,224 @@
+"""Where the usual step reads the arrays of a state, and a state takes over what that did.
+
+Both return None, with nothing changed, where anything is unusual: see :mod:`.observer.step`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.estimates import NormalisedInnovation
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.geometry.sensor_mounting import Sensed
+from slam_observer_ros.observer import core, step
+from slam_observer_ros.observer.flat_arrays import (
+    Advanced,
+    Estimate,
+    Interval,
+    Landmarks,
+    Limits,
+    Observed,
+    Seen,
+)
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.riccati import AT_ONCE
+from slam_observer_ros.sensor_models import sensing
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.state.state import State
+
+_NO_ENTRIES, _NO_IDS = np.empty(0), np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What an observation did to a state."""
+
+    ids: IntArray  # (m,) ids of the landmarks seen that were known before
+    residuals: FloatArray  # (m, 3) before the correction, metres, reference frame
+    rejected: BoolArray  # (m,) which of them were too far off to be used
+    moved_ids: IntArray  # ids of landmarks that it showed to have moved
+    innovation: NormalisedInnovation | None = None
+
+
+def advance(
+    state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
+) -> FloatArray | None:
+    """Move a state on between two stamps (27); return the variances (6,) of the motion by axis."""
+    x = _estimate(state)
+    if x is None:
+        return None
+    filter_, calibration, p = state.filter, state.filter.calibration, state.axes.p
+    reach_ns = calibration.delay_error_ns
+    interval = Interval(start_ns, end_ns, calibration.delay_ns, reach_ns, state._end_velocity)
+    out = Advanced(
+        np.empty((4, 4)),
+        np.empty((p, p)),
+        np.empty((p, p)),
+        np.empty((p, calibration.count)),
+        np.empty(6),
+        np.empty(6),
+    )
+    status = core.advance(x, velocities.flat(), interval, filter_.motion_noise.figures, out)
+    if status == step.UNUSUAL:
+        return None
+    if state.relinearisation is not None and state.relinearisation.is_active:
+        history = state.relinearisation.history
+        history.begin(x.A)
+        drift = x.drift * to_s(end_ns - start_ns)
+        history.move_on(out.A, out.noise, out.sensitivity, drift, calibration)
+    of_driving = out.noise - out.of_turning
+    is_rest = status == step.AT_REST
+    filter_.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
+    x.A[...] = out.A
+    if reach_ns:
+        state._end_velocity = out.at_end
+    return out.variances
+
+
+def observe(state: State, event: ObservationEvent) -> Outcome | None:
+    """Let a state use an observation (28)–(31) made at its instant."""
+    if not 0 < len(event.ids) <= AT_ONCE or not len(state.landmarks.ids):
+        return None
+    x, seen = _estimate(state), _seen(state, event)
+    if x is None or seen is None:
+        return None
+    settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
+    m, factors = len(event.ids), noise.flat()
+    out = Observed(
+        np.empty((4, 4)),
+        np.empty(m, dtype=np.int64),
+        np.empty((m, 3)),
+        np.empty((m, 3)),
+        np.empty(m),
+        np.empty((m, 3)),
+        np.empty((m, 3)),
+        np.empty((0 if event.covariances is None else m, 3, 3)),
+        np.empty(m),
+        np.empty(x.first - state.axes.p),
+        np.empty(3 * m + 1) if state.judges_innovations else _NO_ENTRIES,
+    )
+    limits = Limits(
+        settings.rejection_threshold,
+        settings.huber_threshold,
+        settings.observation_correlation_time,
+        settings.confirmations,
+        settings.max_rejections,
+        settings.max_hypotheses > 1,
+    )
+    landmarks = Landmarks(
+        table._sorted_ids,
+        table._order,
+        table.counts,
+        table.rejections,
+        table.last_seen_ns,
+        table.seen_before_ns,
+    )
+    figures = state.observation_noise.figures
+    if core.observe(x, landmarks, seen, figures, limits, factors, out) == step.UNUSUAL:
+        return None
+    noise.take(factors)
+    before = x.A.copy()
+    x.A[...] = out.A
+    if len(out.shift):
+        state.filter.calibration.shift(out.shift)
+    state.rejected_in_a_row, state.was_contradicted = 0, False
+    _record(state, event, seen, before, out)
+    return Outcome(event.ids, out.r, np.zeros(m, dtype=np.bool_), _NO_IDS, _innovation(state, out))
+
+
+def _estimate(state: State) -> Estimate | None:
+    """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
+    joint, observer, calibration = state.filter.joint, state.observer, state.filter.calibration
+    if type(joint) is not JointCovariance or joint.chart.stride > state.axes.point:
+        return None
+    if observer.have_moved:
+        return None
+    return Estimate(
+        observer.A,
+        observer.y_ref,
+        observer.a,
+        joint._matrix._storage,
+        joint._matrix._size,
+        joint.first,
+        state.settings.two_d_mode,
+        calibration._all,
+        calibration._estimated,
+        calibration.drift_covariance,
+    )
+
+
+def _seen(state: State, event: ObservationEvent) -> Seen | None:
+    """Return points, and what of their sensor is calibrated; None where there is more to them."""
+    if event.velocities is not None or event.orientations is not None:
+        return None
+    if event.sensed is not None:  # late, and carried forward
+        return None
+    arms, covariances = _plain(event.lines_of_sight), event.covariances
+    ids, origins = np.ascontiguousarray(event.ids, np.int64), event.sensor
+    calibration = state.filter.calibration
+    values, estimated, column = None, _NO_IDS, 0
+    if calibration.corrects_points:
+        sensor = calibration.sensors.get(event.sensor_frame)
+        if sensor is None:  # seen for the first time
+            return None
+        values, estimated = sensor.values, sensor.estimated
+        column = calibration.columns(sensor).start
+    if state.settings.range_is_depth:
+        cosines = sensing.cosines(arms, event.sensor_axis)
+        arms = arms / cosines[:, None]
+        if covariances is not None:
+            covariances = covariances / cosines[:, None, None] ** 2
+    return Seen(
+        event.stamp_ns,
+        ids,
+        arms,
+        None if origins is None else _plain(origins),
+        None if covariances is None else _plain(covariances),
+        values,
+        estimated,
+        column,
+    )
+
+
+def _plain(array: FloatArray) -> FloatArray:
+    """Return an array that may be of another precision or order as C has it."""
+    return np.ascontiguousarray(array, np.float64)
+
+
+def _record(
+    state: State, event: ObservationEvent, seen: Seen, before: FloatArray, out: Observed
+) -> None:
+    """Keep an observation to be linearised again, if it is."""
+    past = state.relinearisation
+    if past is None:
+        return
+    past.note_correction(before, out.A)
+    if not past.is_active:
+        return
+    sensed = None
+    if seen.sensor is not None:
+        number = state.filter.calibration.sensors[event.sensor_frame].number
+        origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
+        sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
+    stated = out.covariances if len(out.covariances) else None
+    keyframe = Keyframe(
+        event.stamp_ns, out.rows, out.points, out.lines_of_sight, stated, out.dt_s, None, sensed
+    )
+    past.add(keyframe, in_doubt=False)
+
+
+def _innovation(state: State, out: Observed) -> NormalisedInnovation | None:
+    """Return how far off the residuals were, if that was asked for."""
+    if not len(out.judged):
+        return None
+    m = len(out.rows)
+    distances, densities, shares = out.judged[:-1].reshape(3, m)
+    nis = float(out.judged[-1])
+    return NormalisedInnovation(
+        distances, out.weights, nis, m * state.axes.point, densities, shares
+    )

@@ -1,0 +1,174 @@
+"""Arguments of the usual step, at random: of motions and of observations, planar and in space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.observer.flat_arrays import (
+    Advanced,
+    Estimate,
+    Interval,
+    Landmarks,
+    Limits,
+    Observed,
+    Seen,
+)
+from slam_observer_ros.sensor_models.motion_noise import Factors, MotionFigures
+from slam_observer_ros.sensor_models.observation_noise import PointFigures
+from slam_observer_ros.sensor_models.velocity_history import NEVER_NS, Velocities
+
+SECOND_NS = 1_000_000_000
+START_NS = 1_700_000_000 * SECOND_NS
+
+
+def random_covariance(rng, size, scale=0.1):
+    M = rng.standard_normal((size, size + 2))
+    return scale**2 * M @ M.T / size
+
+
+def random_estimate(rng, n=None):
+    is_planar = bool(rng.integers(2))
+    p, k = (3, 2) if is_planar else (6, 3)
+    velocity_entries = rng.permutation(12)[: rng.integers(1, 7)]
+    estimated = np.sort(np.append(velocity_entries, 12)).astype(np.int64)
+    c = len(estimated) + int(rng.integers(0, 4))
+    n = int(rng.integers(1, 40)) if n is None else n
+    size = p + c + k * n
+    room = size + int(rng.integers(0, 9))
+    P = np.zeros((room, room))
+    P[:size, :size] = random_covariance(rng, size)
+    calibration = np.append(np.ones(6), np.zeros(7)) + 0.02 * rng.standard_normal(13)
+    A = se3.exp(rng.standard_normal(6))
+    y_ref, a = 5.0 * rng.standard_normal((n, 3)), 0.1 * rng.standard_normal((n, 3))
+    if is_planar:
+        A = se3.flatten(A)
+        y_ref[:, 2] = a[:, 2] = 0.0
+    drift = np.diag(rng.uniform(0.0, 1e-6, c)) * rng.integers(2)
+    return Estimate(A, y_ref, a, P, size, p + c, is_planar, calibration, estimated, drift)
+
+
+def random_motion(rng):
+    """Return arguments of ``advance``."""
+    x = random_estimate(rng)
+    r = int(rng.integers(2, 30))
+    steps_ns = rng.integers(1_000_000, 100_000_000, r)
+    stamps_ns = START_NS + np.cumsum(steps_ns)
+    stamps_ns[0] = NEVER_NS
+    since_ns = np.column_stack([stamps_ns - rng.integers(0, 10_000_000, r), stamps_ns])
+    V = rng.standard_normal((r, 6)) * (rng.random((r, 1)) < 0.9)
+    is_stated = np.zeros((r, 2), dtype=np.bool_)
+    usual_s = tuple(rng.choice([0.02, 0.1, np.inf], 2).tolist())
+    velocities = Velocities(stamps_ns, V, since_ns, is_stated, usual_s, SECOND_NS)
+    begin_ns = int(rng.integers(stamps_ns[1], stamps_ns[-1] + 1))
+    end_ns = begin_ns + int(rng.integers(1, 500_000_000))
+    delay_ns = int(rng.integers(-50_000_000, 50_000_000))
+    at_start = rng.standard_normal(6) if rng.integers(2) else None
+    reach_ns = int(rng.choice([0, 200_000_000]))
+    interval = Interval(begin_ns, end_ns, delay_ns, reach_ns, at_start)
+    scales = rng.uniform(0.0, 0.1, 6) * rng.integers(2)
+    figures = MotionFigures(rng.uniform(1e-5, 1e-2, 6), scales, rng.uniform(0.5, 2.0, 2))
+    p = 3 if x.is_planar else 6
+    out = Advanced(
+        np.zeros((4, 4)),
+        np.zeros((p, p)),
+        np.zeros((p, p)),
+        np.zeros((p, x.first - p)),
+        np.zeros(6),
+        np.zeros(6),
+    )
+    return x, velocities, interval, figures, out
+
+
+def random_observation(rng):
+    """Return arguments of ``observe``."""
+    x = random_estimate(rng)
+    n, p, k = len(x.a), 3 if x.is_planar else 6, 2 if x.is_planar else 3
+    m = int(rng.integers(1, min(n, 8) + 1))
+    rows, ids = rng.permutation(n)[:m], rng.permutation(10 * n)[:n].astype(np.int64)
+    order = np.argsort(ids)
+    now_ns = START_NS
+    last_ns = now_ns - rng.integers(0, 3, n) * SECOND_NS
+    before_ns = np.where(rng.random(n) < 0.3, -1, last_ns - SECOND_NS)
+    counts, rejections = rng.integers(1, 9, n), rng.integers(0, 2, n) * rng.integers(0, 2)
+    landmarks = Landmarks(ids[order], order, counts, rejections, last_ns, before_ns)
+    expected = (x.y_ref[rows] + x.a[rows] - x.A[:3, 3]) @ x.A[:3, :3]
+    points = expected + 0.1 * rng.standard_normal((m, 3)) * (1.0, 1.0, 1.0 - x.is_planar)
+    origins = 0.2 * rng.standard_normal((m, 3)) if rng.integers(2) else None
+    c_v = len(x.estimated)
+    c_s = x.first - p - c_v
+    is_calibrated = bool(rng.integers(2))
+    seen = Seen(
+        now_ns,
+        ids[rows] if rng.random() < 0.95 else ids[rows] + 1,
+        points if origins is None else points - origins,
+        origins,
+        np.array([random_covariance(rng, 3, rng.choice([0.0, 0.1])) for _ in rows])
+        if rng.integers(2)
+        else None,
+        0.01 * rng.standard_normal(7) if is_calibrated else None,
+        np.sort(rng.permutation(7)[:c_s]).astype(np.int64),
+        c_v,
+    )
+    huber, error_time_s = float(rng.choice([0.0, 1.345])), float(rng.choice([0.0, 0.5]))
+    limits = Limits(6.0, huber, error_time_s, 3, 4, bool(rng.integers(2)))
+    factors = None
+    if rng.integers(2):
+        shares = np.array([random_covariance(rng, p, 0.02) for _ in range(2)])
+        logs, information = rng.standard_normal(2), random_covariance(rng, 2, 1.0)
+        factors = Factors(shares, logs, information, np.exp(np.maximum(logs, 0.0)), 0.0)
+    out = Observed(
+        np.zeros((4, 4)),
+        np.zeros(m, dtype=np.int64),
+        *(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3))),
+        np.zeros((0 if seen.covariances is None else m, 3, 3)),
+        np.zeros(m),
+        np.zeros(x.first - p),
+        np.zeros(int(rng.choice([0, 3 * m + 1]))),
+    )
+    figures = PointFigures(*rng.uniform(1e-4, 1e-2, 5).tolist())
+    assert x.size == x.first + k * n
+    return x, landmarks, seen, figures, limits, factors, out
+
+
+def wrong(rng, arguments):
+    """Return the arguments with one of them, or a part of one, exchanged for something else."""
+    arguments = list(arguments)
+    at = int(rng.integers(len(arguments)))
+    if arguments[at] is None:
+        arguments[at] = 3
+        return arguments
+    parts = list(arguments[at])
+    part = int(rng.integers(len(parts)))
+    value = parts[part]
+    others = [None, 'x', -1, 2**62, -(2**62), 10**30, float('nan'), np.empty(0), (), b'']
+    if isinstance(value, np.ndarray):
+        others += [
+            value[..., None],
+            value[:-1] if value.ndim else value,
+            value.astype(np.float32),
+            np.asfortranarray(np.repeat(value, 2, axis=-1))[..., ::2] if value.ndim else value,
+            np.full(value.shape, 2**62, dtype=np.int64),
+            np.full(value.shape, np.nan),
+            np.full(value.shape, 1e300),
+            np.zeros_like(value),
+        ]
+    parts[part] = others[int(rng.integers(len(others)))]
+    arguments[at] = type(arguments[at])(*parts)
+    return arguments
+
+
+def fuzz(core, seed, rounds):
+    """Call both functions with arguments that are right and with wrong ones; count refusals."""
+    rng, refused = np.random.default_rng(seed), 0
+    for _ in range(rounds):
+        for call, arguments in (
+            (core.advance, random_motion(rng)),
+            (core.observe, random_observation(rng)),
+        ):
+            call(*arguments)
+            try:
+                call(*wrong(rng, arguments))
+            except (ValueError, TypeError, BufferError, OverflowError):
+                refused += 1
+    return refused

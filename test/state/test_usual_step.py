@@ -1,0 +1,152 @@
+"""The usual step does what the general one does: every step of every world, through both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.state import usual
+from slam_observer_ros.state.matching import match
+from slam_observer_ros.state.step import step
+
+BENCHMARK = Path(__file__).resolve().parents[2] / 'benchmark'
+WORLDS = (
+    'Starry Night',
+    'MRCLAM 6, robot 1',
+    'Victoria Park',
+    'cityTrees10000',
+    "the paper's circle with noise",
+    'simulated loop, 3D stereo',
+    'simulated loop, wheeled',
+)
+OBSERVATIONS, USUAL_SHARE = 60, 0.5
+ROUNDING = 1e-12
+
+
+@pytest.fixture(name='worlds')
+def fixture_worlds(monkeypatch):
+    if not BENCHMARK.is_dir():
+        pytest.skip('the benchmark is not installed')
+    monkeypatch.syspath_prepend(str(BENCHMARK))
+    import worlds
+
+    return worlds
+
+
+def parts(state):
+    """All that a step changes of a state, by name."""
+    history, factors, table = (
+        state.relinearisation.history,
+        state.motion_noise.factors,
+        state.landmarks,
+    )
+    latest = history._new[-1].keyframe if history._new else None
+    return {
+        'A': state.observer.A,
+        'a': state.observer.a,
+        'P': state.filter.joint.P,
+        'calibration': state.filter.calibration.values,
+        'factors': np.concatenate([factors._logs, factors._information.ravel(), factors.applied]),
+        'shares': np.zeros(()) if factors._shares is None else factors._shares,
+        'noise': history._motion_noise,
+        'sensitivity': history._sensitivity,
+        'drift': history._drift,
+        'end velocity': np.zeros(0) if state._end_velocity is None else state._end_velocity,
+        'table': np.concatenate(
+            [table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns]
+        ),
+        'turned': np.array([state.relinearisation._turn_squared]),
+        'lines of sight': np.zeros(0) if latest is None else latest.lines_of_sight,
+        'stated': np.zeros(0)
+        if latest is None or latest.covariances is None
+        else latest.covariances,
+        'points': np.zeros(0) if latest is None else latest.points,
+        'since': np.zeros(0) if latest is None else np.nan_to_num(latest.dt_s, posinf=1e6),
+    }
+
+
+def assert_same(state, other, what):
+    for (name, value), expected in zip(parts(state).items(), parts(other).values(), strict=True):
+        assert value.shape == expected.shape, (what, name)
+        scale = max(float(np.abs(expected).max(initial=0.0)), 1e-9)
+        off = float(np.abs(value - expected).max(initial=0.0)) / scale
+        assert off <= ROUNDING, f'{what}: {name} is off by {off:.1e}'
+
+
+class BothWays:
+    """Lets hypotheses take each step through both, and counts the usual ones."""
+
+    def __init__(self, monkeypatch):
+        self.usual = self.observed = self.moved = 0
+        self._advance, self._observe = usual.advance, usual.observe
+        monkeypatch.setattr(usual, 'advance', self.advance)
+        monkeypatch.setattr(usual, 'observe', self.observe)
+
+    def advance(self, state, velocities, start_ns, end_ns):
+        other = state.copy()
+        variances = self._advance(state, velocities, start_ns, end_ns)
+        if variances is None:
+            assert_same(state, other, 'an unusual motion')
+            return None
+        motion = other.motion(velocities, start_ns, end_ns)
+        other.propagate(motion)
+        assert_same(state, other, f'the motion to {end_ns}')
+        np.testing.assert_allclose(variances, np.diagonal(motion.covariances.sum(axis=0)))
+        self.moved += 1
+        return variances
+
+    def observe(self, state, event):
+        other = state.copy()
+        self.observed += 1
+        outcome = self._observe(state, event)
+        if outcome is None:
+            assert_same(state, other, 'an unusual observation')
+            return None
+        self.usual += 1
+        expected = step(other, match(other, event))
+        assert_same(state, other, f'the observation at {event.stamp_ns}')
+        np.testing.assert_array_equal(outcome.ids, expected.ids)
+        np.testing.assert_allclose(outcome.residuals, expected.residuals, atol=1e-12)
+        assert not expected.rejected.any()
+        for name in ('distances', 'weights', 'log_densities', 'shares', 'nis'):
+            one, two = (getattr(o.innovation, name) for o in (outcome, expected))
+            np.testing.assert_allclose(one, two, rtol=1e-8, atol=1e-9, err_msg=name)
+        return outcome
+
+
+@pytest.mark.parametrize('name', WORLDS)
+def test_a_usual_step_is_the_general_one_to_rounding(worlds, monkeypatch, name):
+    if name not in worlds.names():
+        pytest.skip('the recordings are not there')
+    world = worlds.load(name)
+    both = BothWays(monkeypatch)
+    # Relinearising would multiply rounding, and has no part in the step.
+    settings = replace(world.settings, relinearization_angle=1e3)
+    estimator = Estimator(settings, judges_innovations=True)
+    for event in world.events:
+        estimator.add(event)
+        if isinstance(event, ObservationEvent) and both.observed >= OBSERVATIONS:
+            break
+    assert both.usual >= USUAL_SHARE * both.observed
+    assert both.moved >= USUAL_SHARE * both.observed
+
+
+def test_points_of_any_precision_and_order_are_taken(worlds):
+    """As the checks let them pass, from whatever library they come."""
+    world = worlds.load('simulated loop, wheeled')
+    poses = []
+    for make in (lambda array: array, lambda array: np.asfortranarray(array.astype(np.float32))):
+        estimator = Estimator(world.settings)
+        for event in world.events[:600]:
+            if isinstance(event, ObservationEvent):
+                ids = np.repeat(event.ids.astype(np.int32), 2)[::2]
+                points, stated = make(event.points), make(event.covariances)
+                event = replace(event, ids=ids, points=points, covariances=stated)
+            assert estimator.add(event)
+        poses.append(estimator.pose)
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-4)
