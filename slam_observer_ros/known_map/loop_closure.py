@@ -74,7 +74,7 @@ class LoopClosure:
 
     def is_due(self, state: State, stamp_ns: int) -> bool:
         """Return whether it is time to look for landmarks that are one."""
-        if not state.is_mapping or not state.filter.has_joint_covariance:
+        if not state.is_mapping:
             return False
         if self._last_ns is not None and 0 <= stamp_ns - self._last_ns < PERIOD_NS:
             return False
