@@ -73,7 +73,7 @@ class CompressedCovariance(JointCovariance):
         n = len(observer.y_ref)
         self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
         self._set_active(np.arange(n), n)
-        self._outside = OutsideLandmarks(self._axes, self._stride, len(self.P))
+        self._outside = OutsideLandmarks(self.chart, len(self.P))
         # (n,) where each landmark is outside, −1 for nowhere; and (slots,) which ones are there
         self._slots = np.full(n, -1)
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
