@@ -64,6 +64,9 @@ NOTABLY_WRONG, TOO_WRONG = math.sqrt(1.5), 2.0
 """Factors of the stated noise that are worth a note, and those that neither chance nor a sensor's
 usual correlation explains."""
 
+NOISELESS = 0.01
+"""Share of the stated noise below which there is none at all."""
+
 MOUNTED = {
     'sensor_rotation': (
         (
@@ -234,9 +237,9 @@ def of_noise(factors: Iterable[MotionFactor]) -> list[Finding]:
 def of_fit(factor: float | None) -> list[Finding]:
     """Judge how many times as large as stated innovations are; None if that is not known.
 
-    Zero is that of sensors without any noise, as a simulation's may be.
+    Next to nothing is that of sensors without any noise, as a simulation's may be.
     """
-    if factor is None or factor == 0.0:
+    if factor is None or factor < NOISELESS:
         return []
     if factor > NOTABLY_WRONG:
         level = Level.WARNING if factor > TOO_WRONG else Level.NOTE

@@ -13,7 +13,7 @@ from slam_observer_ros.cli.calibrate.stated import Found
 from slam_observer_ros.cli.calibrate.trades import COMMON_SCALE, trades
 from slam_observer_ros.cli.tune.material import Material
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, of_points, scaled
-from slam_observer_ros.cli.tune.noise_search import search_noise
+from slam_observer_ros.cli.tune.search import search_noise
 from slam_observer_ros.cli.tune.verdict import judge, Judged, SURE
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.units import to_ns
