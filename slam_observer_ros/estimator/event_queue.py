@@ -119,6 +119,22 @@ class EventQueue:
         self._take_ahead(event, self.newest_ns)
         return False
 
+    def passes(self, event: Event) -> bool:
+        """Take an event that need not wait, and nothing waits for; return whether it is one.
+
+        That is what :meth:`push` and :meth:`pop_ready` do with an event that is in time and the
+        newest of all, where none has been late.
+        """
+        newest_ns = self.newest_ns
+        if newest_ns is None or self._window.length_ns or not self._events.are_none:
+            return False
+        if not 0 < event.stamp_ns - newest_ns <= self._usual_ns:
+            return False
+        if not self._events.note(_key(event), newest_ns - self._reach_ns):
+            return False
+        self._note_in_time(event, newest_ns)
+        return True
+
     def push_velocities(self, velocities: VelocityBlock) -> bool:
         """Take velocities if :meth:`push` would find each of them in time, and newest of all.
 
@@ -153,8 +169,11 @@ class EventQueue:
         return self._events.pop_all()
 
     def _take_in_time(self, event: Event, newest_ns: int) -> None:
-        stamp_ns = event.stamp_ns
         self._events.insert(event, newest_ns - self._reach_ns)
+        self._note_in_time(event, newest_ns)
+
+    def _note_in_time(self, event: Event, newest_ns: int) -> None:
+        stamp_ns = event.stamp_ns
         if event.receive_ns is not None:
             self._reception.note(stamp_ns, event.receive_ns)
         self._window.note(stamp_ns, newest_ns)
@@ -224,6 +243,9 @@ class _Window:
             self._begin_ns = newest_ns
         oldest_ns = newest_ns - LATENESS_NS
         late, late_ns = self._late, newest_ns - stamp_ns if stamp_ns < newest_ns else 0
+        if not (late_ns or self.length_ns) and len(late) == 1 and not late[0][1]:
+            late[0] = newest_ns, 0  # as nearly always: it is the latest that none was late
+            return
         while late and late[-1][1] <= late_ns:
             late.pop()
         late.append((newest_ns, late_ns))
@@ -244,12 +266,24 @@ class _SortedEvents:
 
     def insert(self, event: Event, oldest_ns: int) -> None:
         """Add an event; raise InvalidEventError if it is known. None before ``oldest_ns`` come."""
-        key, known = _key(event), self.known
-        if key in known:
+        key = _key(event)
+        if not self.note(key, oldest_ns):
             raise InvalidEventError('duplicate', 'this event is already known')
-        known.add(key)
         heapq.heappush(self._heap, (key, event))
-        self._forget_known(oldest_ns)
+
+    def note(self, key: Key, oldest_ns: int) -> bool:
+        """Note an event, that is used at once, as known; return whether it was not."""
+        if key in self.known:
+            return False
+        self.known.add(key)
+        if len(self.known) > self._most_known:
+            self._forget_known(oldest_ns)
+        return True
+
+    @property
+    def are_none(self) -> bool:
+        """Whether no event is held back."""
+        return not (self._heap or self._blocks)
 
     def insert_velocities(self, velocities: VelocityBlock, oldest_ns: int) -> bool:
         """Add velocities newer than all others; return False, and add none, if one is known."""
@@ -258,13 +292,14 @@ class _SortedEvents:
             return False
         self.known.update(keys)
         self._blocks.append(velocities)
-        self._forget_known(oldest_ns)
+        if len(self.known) > self._most_known:
+            self._forget_known(oldest_ns)
         return True
 
     def _forget_known(self, oldest_ns: int) -> None:
-        if len(self.known) > self._most_known:  # O(1) for each event
-            self.known = {key for key in self.known if key[0] >= oldest_ns}
-            self._most_known = max(2 * len(self.known), MIN_KNOWN)
+        # After twice as many as were kept: O(1) for each event.
+        self.known = {key for key in self.known if key[0] >= oldest_ns}
+        self._most_known = max(2 * len(self.known), MIN_KNOWN)
 
     def pop_until(self, stamp_ns: int) -> list[Ready]:
         ready: list[Ready] = []

@@ -99,7 +99,8 @@ class Timeline:
         self._in_force_ns = stamp_ns
         self._note_stamp(stamp_ns)
         self._pending += 1
-        self.advance_after_many()
+        if self._pending >= MAX_PENDING_VELOCITIES:
+            self.advance_after_many()
         return True
 
     def takes(self, velocities: VelocityBlock) -> bool:

@@ -1,6 +1,6 @@
 """The estimate as ROS messages, the same for the node and for a recording.
 
-``state_messages`` has those of the state, of which there are many more.
+Markers are for RViz and Foxglove. ``state_messages`` has those of the state, which are many more.
 """
 
 from __future__ import annotations
@@ -8,12 +8,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.messages.markers import MarkerMessages
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
+
+POINT_SIZE_M = 0.2
+TEXT_HEIGHT_M = 0.3
+LINE_WIDTH_M = 0.03
+ARROW_LENGTH_M, ARROW_WIDTH_M = 1.0, 0.15
+
+GREEN = (0.0, 0.62, 0.45, 1.0)  # red, green, blue, opacity
+WHITE = (1.0, 1.0, 1.0, 1.0)
+PALE_GREEN = (0.0, 0.62, 0.45, 0.3)
+ORANGE = (0.84, 0.37, 0.0, 1.0)
+
+MAX_LABELS = 200  # more could not be read, and each is a message of its own
+ELLIPSOID_SIGMAS = 3.0  # half axes, in standard deviations
+MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
+
+# Of visualization_msgs/Marker
+ADD, DELETEALL = 0, 3
+ARROW, SPHERE, LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING = 0, 2, 5, 7, 9
 
 
 class EstimateMessages:
@@ -53,3 +73,147 @@ class EstimateMessages:
     def value(self, value: float) -> Any:
         """Make a std_msgs/Float64."""
         return self._messages.make('std_msgs/msg/Float64', data=float(value))
+
+
+class MarkerMessages:
+    """Makes MarkerArrays, of the classes that ``messages`` makes.
+
+    A stamp is in nanoseconds; ids (n,), points (n, 3) in metres and covariances (n, 3, 3) in m²,
+    None if unknown, are in the frame ``frame_id``.
+    """
+
+    def __init__(self, messages: OutgoingMessages, frame_id: str) -> None:
+        self._messages = messages
+        self._frame_id = frame_id
+
+    def landmarks(
+        self,
+        stamp_ns: int,
+        ids: IntArray,
+        points: FloatArray,
+        covariances: FloatArray | None,
+        update: Update | None,
+    ) -> Any:
+        """Return markers that replace all earlier ones.
+
+        They are points, ids, the last residuals and, where covariances are known, ellipsoids.
+        """
+        if not len(points):
+            return self.none(stamp_ns)
+        header = self._messages.header(stamp_ns, self._frame_id)
+        labels = [
+            self._label(header, number, landmark_id, point)
+            for number, (landmark_id, point) in enumerate(
+                zip(ids[:MAX_LABELS].tolist(), points, strict=False)
+            )
+        ]
+        lines = self._residual_lines(header, ids, points, update)
+        ellipsoids = self._ellipsoids(header, points, covariances)
+        drawn = [self._points(header, points), lines, *ellipsoids, *labels]
+        return self._array([self._removal(header), *drawn])
+
+    def places(self, stamp_ns: int, poses: FloatArray) -> Any:
+        """Return arrows, in place of all earlier markers, at poses (q, 4, 4) of a lost robot."""
+        header = self._messages.header(stamp_ns, self._frame_id)
+        arrows = []
+        for number, pose in enumerate(poses[:MAX_LABELS]):
+            arrow = self._marker(header, 'possible places', ARROW, ORANGE, ARROW_WIDTH_M)
+            arrow.id = number
+            arrow.pose = self._messages.pose(pose)
+            arrow.scale.x = ARROW_LENGTH_M
+            arrows.append(arrow)
+        return self._array([self._removal(header), *arrows])
+
+    def none(self, stamp_ns: int) -> Any:
+        """Return what removes all earlier markers."""
+        return self._array([self._removal(self._messages.header(stamp_ns, self._frame_id))])
+
+    def _array(self, markers: list[Any]) -> Any:
+        return self._messages.make('visualization_msgs/msg/MarkerArray', markers=markers)
+
+    def _removal(self, header: Any) -> Any:
+        return self._marker(header, '', 0, WHITE, 0.0, action=DELETEALL)
+
+    def _points(self, header: Any, points: FloatArray) -> Any:
+        marker = self._marker(header, 'landmarks', SPHERE_LIST, GREEN, POINT_SIZE_M)
+        marker.points = [self._messages.point(point) for point in points]
+        return marker
+
+    def _ellipsoids(
+        self, header: Any, points: FloatArray, covariances: FloatArray | None
+    ) -> list[Any]:
+        """Return an ellipsoid for each of the first landmarks; none if no covariance is known."""
+        if covariances is None:
+            return []
+        variances, axes = np.linalg.eigh(covariances[:MAX_LABELS])
+        axes *= np.linalg.det(axes)[:, None, None]  # a rotation, not a reflection
+        sizes_m = 2.0 * ELLIPSOID_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+        markers = []
+        for number, (point, size, turn) in enumerate(zip(points, sizes_m, axes, strict=False)):
+            marker = self._marker(header, 'uncertainties', SPHERE, PALE_GREEN, MIN_SIZE_M)
+            marker.id = number
+            marker.pose.position = self._messages.point(point)
+            marker.pose.orientation = self._messages.quaternion(turn)
+            marker.scale = self._messages.vector(np.maximum(size, MIN_SIZE_M))
+            markers.append(marker)
+        return markers
+
+    def _residual_lines(
+        self, header: Any, ids: IntArray, points: FloatArray, update: Update | None
+    ) -> Any:
+        """Return a line from each landmark just seen to where it was seen."""
+        marker = self._marker(header, 'residuals', LINE_LIST, ORANGE, LINE_WIDTH_M)
+        if update is not None:
+            _, seen, rows = np.intersect1d(update.ids, ids, return_indices=True)
+            ends = points[rows]
+            lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
+            marker.points = [self._messages.point(point) for point in lines]
+        return marker
+
+    def _label(self, header: Any, number: int, landmark_id: int, point: FloatArray) -> Any:
+        marker = self._marker(header, 'ids', TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)
+        marker.id = number
+        marker.text = str(landmark_id)
+        marker.pose.position = self._messages.point(point + [0.0, 0.0, TEXT_HEIGHT_M])
+        return marker
+
+    def _marker(
+        self,
+        header: Any,
+        namespace: str,
+        kind: int,
+        color: tuple[float, ...],
+        size_m: float,
+        action: int = ADD,
+    ) -> Any:
+        make, messages = self._messages.make, self._messages
+        red, green, blue, opacity = color
+        return make(
+            'visualization_msgs/msg/Marker',
+            header=header,
+            ns=namespace,
+            id=0,
+            type=kind,
+            action=action,
+            pose=messages.pose(np.eye(4)),
+            scale=messages.vector(np.full(3, size_m)),
+            color=make('std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=opacity),
+            lifetime=make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
+            frame_locked=False,
+            points=[],
+            colors=[],
+            texture_resource='',
+            texture=make(
+                'sensor_msgs/msg/CompressedImage',
+                header=messages.header(0, ''),
+                format='',
+                data=messages.octets(b''),
+            ),
+            uv_coordinates=[],
+            text='',
+            mesh_resource='',
+            mesh_file=make(
+                'visualization_msgs/msg/MeshFile', filename='', data=messages.octets(b'')
+            ),
+            mesh_use_embedded_materials=False,
+        )

@@ -8,10 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slam_observer_ros.recording.sources import (
-    in_blocks,
     Loss,
     MessageSource,
-    RawBlock,
     RawMessage,
     Topic,
 )
@@ -25,7 +23,7 @@ _SHOWN = 10
 """First messages that are looked at; one may be damaged."""
 
 
-class DecompressedSource:
+class DecompressedSource(MessageSource):
     """A file whose messages may be compressed one by one.
 
     A message that is damaged is empty, and so counted as malformed. ``directory``, if the file is
@@ -47,12 +45,6 @@ class DecompressedSource:
         """Yield the messages of these topics in the order in which they were received."""
         for raw in self._source.messages(topics):
             yield raw._replace(data=_decompressed(bytes(raw.data)))
-
-    def blocks(
-        self, topics: Collection[Topic], together: Topic
-    ) -> Iterator[RawMessage | RawBlock]:
-        """Yield the same, those of one of the topics in blocks."""
-        return in_blocks(self.messages(topics), together)
 
     def close(self) -> None:
         """Close the file."""

@@ -1,10 +1,11 @@
-"""How a recording defines the messages of detectors: packages change, and keep the names."""
+"""How a recording defines its messages: packages change, and keep the names; ROS 1 as ROS 2."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache, cached_property, partial
+import re
 from typing import Any, TYPE_CHECKING
 
 from slam_observer_ros.common.errors import MessageError, RecordingError
@@ -16,11 +17,27 @@ from slam_observer_ros.messages.detections import (
     OTHER_DETECTIONS,
 )
 from slam_observer_ros.messages.registry import Decode, decoders
-from slam_observer_ros.recording.ros1 import types_in
 from slam_observer_ros.settings.message_types import message_types
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+
+_IDL = re.compile(r'\s*(=+\s*IDL:|#include|module\b)')
+
+
+def types_in(definition: str, message_type: str) -> dict[str, Any]:
+    """Return what a definition defines, as rosbags has it; nothing if it can't be read."""
+    if not definition:
+        return {}
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg, TypesysError
+
+    try:
+        if _IDL.match(definition):
+            return dict(get_types_from_idl(definition))
+        return dict(get_types_from_msg(definition, message_type))
+    except (TypesysError, LookupError, ValueError):
+        return {}
 
 
 @cache
@@ -106,3 +123,23 @@ def _layout(store: Typestore, message_type: str) -> tuple[object, ...]:
         return kind.name, of(what[0]) if isinstance(what[0], tuple) else what[0], what[1]
 
     return tuple(of(described) for _, described in store.fielddefs[message_type][1])
+
+
+class Ros1Messages:
+    """Turns serialised messages of ROS 1 into CDR."""
+
+    @cached_property
+    def _typestore(self) -> Typestore:
+        from rosbags.typesys import get_typestore, Stores  # which takes a while to import
+
+        return get_typestore(Stores.ROS2_JAZZY)
+
+    def to_cdr(self, data: bytes, message_type: str, definition: str) -> memoryview:
+        """Return a message as CDR; raise RecordingError if nothing defines its type."""
+        types = self._typestore.types
+        if message_type not in types:
+            defined = types_in(definition, message_type)
+            self._typestore.register({k: v for k, v in defined.items() if k not in types})
+        if message_type not in types:
+            raise RecordingError(f'messages of type {message_type} are read of ROS 2 only')
+        return self._typestore.ros1_to_cdr(data, message_type)

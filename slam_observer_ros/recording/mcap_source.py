@@ -32,6 +32,7 @@ from slam_observer_ros.recording.sources import (
     damage_reported,
     FEWEST_IN_BLOCK,
     Loss,
+    MessageSource,
     MOST_IN_BLOCK,
     RawBlock,
     RawMessage,
@@ -60,7 +61,7 @@ class _Messages(NamedTuple):
         return rows
 
 
-class McapSource:
+class McapSource(MessageSource):
     """An MCAP file; of a damaged one, the whole records before and behind the damage.
 
     ``other_encodings`` are those of the channels that are left out, as they are not CDR, and how
@@ -88,7 +89,7 @@ class McapSource:
 
     @property
     def loss(self) -> Loss:
-        """What is damaged or missing, also of what the statistics in the file count."""
+        """What has been found damaged so far."""
         return self._records.loss
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
@@ -104,9 +105,6 @@ class McapSource:
         ordered = list(topics)
         for messages in self._in_order(ordered):
             yield from _in_runs(messages, ordered, together)
-
-    def close(self) -> None:
-        """Do nothing: the file is open only while it is read."""
 
     @contextmanager
     def _mapped(self) -> Iterator[mmap.mmap]:

@@ -13,13 +13,11 @@ from typing import NamedTuple, TypeAlias
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.recording.ros1 import Ros1Messages
+from slam_observer_ros.recording.definitions import Ros1Messages
 from slam_observer_ros.recording.sources import (
     by_key,
-    in_blocks,
     Loss,
     MessageSource,
-    RawBlock,
     RawMessage,
     Topic,
 )
@@ -52,7 +50,7 @@ Scan: TypeAlias = Callable[[mmap.mmap], Iterator[Found]]
 """Reads a file from its beginning to its end, whatever is in it, and raises nothing."""
 
 
-class SalvagedSource:
+class SalvagedSource(MessageSource):
     """The whole messages of a damaged .db3 or .bag file."""
 
     def __init__(self, path: Path, scan: Scan) -> None:
@@ -80,12 +78,17 @@ class SalvagedSource:
                 self.start_ns = min(self.start_ns, found.stamp_ns)
                 self.end_ns = max(self.end_ns, found.stamp_ns)
                 self._disorder_ns = max(self._disorder_ns, self.end_ns - found.stamp_ns)
-        self.loss = Loss(byte_count, to_s(gap_ns), is_cut_off)
+        self._loss = Loss(byte_count, to_s(gap_ns), is_cut_off)
         # Several channels may be of one topic.
         parts = {number: replace(channels[number], count=counts[number]) for number in channels}
         topics = by_key(part for part in parts.values() if part.count)
         self.topics = tuple(topics.values())
         self._topic_of = {number: topics[part.key] for number, part in parts.items() if part.count}
+
+    @property
+    def loss(self) -> Loss:
+        """What has been found damaged so far."""
+        return self._loss
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
@@ -100,15 +103,6 @@ class SalvagedSource:
             while held and held[0][0] <= stamp_ns - self._disorder_ns:
                 yield heapq.heappop(held)[-1]
         yield from (raw for *_, raw in sorted(held))
-
-    def blocks(
-        self, topics: Collection[Topic], together: Topic
-    ) -> Iterator[RawMessage | RawBlock]:
-        """Yield the same, those of one of the topics in blocks."""
-        return in_blocks(self.messages(topics), together)
-
-    def close(self) -> None:
-        """Do nothing: the file is open only while it is read."""
 
     def _found(self) -> Iterator[Found]:
         with self._path.open('rb') as file:
@@ -129,7 +123,7 @@ class SalvagedSource:
             return b''  # which is counted as malformed
 
 
-class MendedSource:
+class MendedSource(MessageSource):
     """What rosbags opens; should it turn out to be damaged, what is whole of the rest."""
 
     def __init__(self, whole: MessageSource, salvage: Callable[[], MessageSource]) -> None:
@@ -153,20 +147,8 @@ class MendedSource:
         except RecordingError as error:
             yield from self._rest(error, topics, last_ns)
 
-    def blocks(
-        self, topics: Collection[Topic], together: Topic
-    ) -> Iterator[RawMessage | RawBlock]:
-        """Yield the same, those of one of the topics in blocks."""
-        last_ns: int | None = None
-        try:
-            for raw in self._whole.blocks(topics, together):
-                last_ns = raw.last_ns
-                yield raw
-        except RecordingError as error:
-            yield from in_blocks(self._rest(error, topics, last_ns), together)
-
     def close(self) -> None:
-        """Close the files."""
+        """Close the file."""
         self._whole.close()
         if self._salvaged is not None:
             self._salvaged.close()

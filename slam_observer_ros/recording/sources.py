@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -9,7 +10,7 @@ import heapq
 from itertools import groupby, islice
 from pathlib import Path
 import re
-from typing import NamedTuple, Protocol, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.recording.ros1 import Ros1Messages
+from slam_observer_ros.recording.definitions import Ros1Messages
 
 if TYPE_CHECKING:
     from rosbags import rosbag1, rosbag2
@@ -88,11 +89,6 @@ class RawMessage(NamedTuple):
     receive_stamp_ns: int
     data: Buffer
 
-    @property
-    def last_ns(self) -> int:
-        """When the last of it was received, as a block has it."""
-        return self.receive_stamp_ns
-
     def messages(self) -> Iterator[RawMessage]:
         """Yield this one, as a block yields its own."""
         yield self
@@ -104,11 +100,6 @@ class RawBlock(NamedTuple):
     topic: Topic
     receive_stamps_ns: IntArray  # (k,)
     data: NDArray[np.uint8]  # (k, size) CDR bytes
-
-    @property
-    def last_ns(self) -> int:
-        """When the last of them was received."""
-        return int(self.receive_stamps_ns[-1])
 
     def messages(self) -> Iterator[RawMessage]:
         """Yield them one by one."""
@@ -162,7 +153,7 @@ class Loss:
 NOTHING_LOST = Loss()
 
 
-class MessageSource(Protocol):
+class MessageSource(ABC):
     """An open recording, whatever its format; it was received from ``start_ns`` to ``end_ns``."""
 
     topics: tuple[Topic, ...]
@@ -172,7 +163,9 @@ class MessageSource(Protocol):
     @property
     def loss(self) -> Loss:
         """What has been found damaged so far."""
+        return NOTHING_LOST
 
+    @abstractmethod
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
 
@@ -180,18 +173,17 @@ class MessageSource(Protocol):
         self, topics: Collection[Topic], together: Topic
     ) -> Iterator[RawMessage | RawBlock]:
         """Yield the same, those of one of the topics in blocks."""
+        return in_blocks(self.messages(topics), together)
 
-    def close(self) -> None:
-        """Close the file."""
+    def close(self) -> None:  # noqa: B027 (most are open only while they are read)
+        """Close the file, if it is open while it is not read."""
 
 
-class BagSource:
+class BagSource(MessageSource):
     """A whole .db3 file of rosbag2, or a ROS 1 .bag.
 
     Raises a RecordingError if rosbags can't read it.
     """
-
-    loss = NOTHING_LOST
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -214,12 +206,6 @@ class BagSource:
             for connection, stamp_ns, data in self._reader.messages(wanted):
                 topic = of_connection[connection.id]
                 yield RawMessage(topic, stamp_ns, self._cdr(topic, data))
-
-    def blocks(
-        self, topics: Collection[Topic], together: Topic
-    ) -> Iterator[RawMessage | RawBlock]:
-        """Yield the same, those of one of the topics in blocks."""
-        return in_blocks(self.messages(topics), together)
 
     def close(self) -> None:
         """Close the file."""
@@ -250,7 +236,7 @@ def _reader_of(path: Path) -> rosbag1.Reader | rosbag2.Reader:
     return rosbag1.Reader(path)
 
 
-class SplitSource:
+class SplitSource(MessageSource):
     """The files that one recording was split into, and what is lost with the others.
 
     ``stated_count`` is how many messages the recording should have.
@@ -278,14 +264,8 @@ class SplitSource:
         parts = [self._messages_of(part, topics) for part in self._parts]
         return heapq.merge(*parts, key=lambda raw: raw.receive_stamp_ns)
 
-    def blocks(
-        self, topics: Collection[Topic], together: Topic
-    ) -> Iterator[RawMessage | RawBlock]:
-        """Yield the same, those of one of the topics in blocks."""
-        return in_blocks(self.messages(topics), together)
-
     def close(self) -> None:
-        """Close the files."""
+        """Close the file."""
         for part in self._parts:
             part.close()
 

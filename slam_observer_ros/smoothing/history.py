@@ -125,28 +125,22 @@ class History:
         if motion.is_slip:
             self._slip = motion
             return
-        self.move_on(
-            motion.path[-1],
-            motion.noise,
-            motion.sensitivity,
-            motion.calibration,
-            motion.duration_s,
-        )
+        end, noise, sensitivity = motion.path[-1], motion.noise, motion.sensitivity
+        self.move_on(end, noise, sensitivity, motion.drift, motion.calibration)
 
     def move_on(
         self,
         end: FloatArray,
         noise: FloatArray,
         sensitivity: FloatArray,
+        drift: FloatArray,
         calibration: Calibration,
-        duration_s: float,
     ) -> None:
         """Append a motion to a pose ``end`` (4, 4), with what :class:`.Motion` has of it."""
         self._end = end.copy()  # not a view, which would keep all of a path
         self._motion_noise = self._motion_noise + noise
         self._sensitivity = self._sensitivity + sensitivity
-        if calibration.drifts:
-            self._drift = self._drift + calibration.drift_covariance * duration_s
+        self._drift = self._drift + drift
         self._calibration = calibration.values
 
     def begin(self, pose: FloatArray) -> None:

@@ -69,8 +69,8 @@ def advance(
     if state.relinearisation is not None and state.relinearisation.is_active:
         history = state.relinearisation.history
         history.begin(x.A)
-        duration_s = to_s(end_ns - start_ns)
-        history.move_on(out.A, out.noise, out.sensitivity, calibration, duration_s)
+        drift = x.drift * to_s(end_ns - start_ns)
+        history.move_on(out.A, out.noise, out.sensitivity, drift, calibration)
     of_driving = out.noise - out.of_turning
     is_rest = status == step.AT_REST
     filter_.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))

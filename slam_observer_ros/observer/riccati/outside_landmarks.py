@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
+from slam_observer_ros.observer.chart import Chart
 from slam_observer_ros.observer.riccati.panel_matrix import PANEL_ROWS, PanelMatrix
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 
@@ -85,8 +85,8 @@ class OutsideLandmarks:
     that have been taken in since.
     """
 
-    def __init__(self, axes: EstimatedAxes, stride: int, size: int) -> None:
-        self._axes, self._stride = axes, stride
+    def __init__(self, chart: Chart, size: int) -> None:
+        self._chart, self._axes, self._stride = chart, chart.axes, chart.stride
         self.matrix = PanelMatrix()  # B
         self.panels: list[Panel] = []
         self.size = size  # q₀
@@ -242,7 +242,7 @@ class OutsideLandmarks:
         turns = change.postponed.turns(each[:, k:], panel.turned, self._axes)
         s = len(change.turns)
         D = np.zeros((PANEL_ROWS, s))
-        D.reshape(len(points), self._stride, s)[:, :k] = self._axes.turn_matrix(off)[:, :, :s]
+        D.reshape(len(points), self._stride, s)[:, :k] = -self._chart.still(off)[:, :, :s]
         # … D Zᵀ + Z Dᵀ, as the difference of two squares.
         Z = X[:, :s] + 0.5 * D @ change.turns[:, :s]
         U = np.hstack([before @ change.root, D + Z, D - Z])
