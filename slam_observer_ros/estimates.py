@@ -128,6 +128,14 @@ class MotionFactor:
 
 
 @dataclass(frozen=True, slots=True)
+class RangePower:
+    """The power of the cosine off its axis with which a sensor's ranges grow: 1 for depths."""
+
+    value: float
+    deviation: float
+
+
+@dataclass(frozen=True, slots=True)
 class Smoothed:
     """Trajectory and map, each pose estimated from all that was seen before and after.
 

@@ -185,19 +185,10 @@ class ObservationEvent:
         """Return the points that ``mask`` (m,) picks."""
         if np.count_nonzero(mask) == len(mask):
             return self
-        return replace(
-            self,
-            ids=self.ids[mask],
-            points=self.points[mask],
-            covariances=None if self.covariances is None else self.covariances[mask],
-            velocities=None if self.velocities is None else self.velocities[mask],
-            sensor=None if self.sensor is None else self.sensor[mask],
-            sensed=None if self.sensed is None else self.sensed.select(mask),
-            orientations=None if self.orientations is None else self.orientations[mask],
-            orientation_covariances=None
-            if self.orientation_covariances is None
-            else self.orientation_covariances[mask],
-        )
+        stated = {name: getattr(self, name) for name in _OF_POINTS}
+        picked = {name: array[mask] for name, array in stated.items() if array is not None}
+        sensed = None if self.sensed is None else self.sensed.select(mask)
+        return replace(self, sensed=sensed, **picked)
 
     def without(self, ids: set[int]) -> ObservationEvent:
         """Return the points that are of none of some landmarks."""
@@ -239,5 +230,9 @@ def _turned(covariances: FloatArray, R: FloatArray) -> FloatArray:
     return turned
 
 
+_OF_POINTS = (
+    'ids', 'points', 'covariances', 'velocities', 'sensor', 'orientations',
+    'orientation_covariances',
+)  # fmt: skip
 _PLANAR_VELOCITY = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
 _PLANAR_POINT = np.array([1.0, 1.0, 0.0])

@@ -246,9 +246,9 @@ class Hypotheses:
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         matches = [match(hypothesis.state, event) for hypothesis in self._all]
+        if self.best.filter.joint is None:
+            return self._observe_alone(event, matches[0])
         if len(self._all) == 1 and not unknown:
-            if not self.best.filter.has_joint_covariance:
-                return self._observe_alone(event, matches[0])
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
             if is_clear and not may_relabel(self.best, matches[0]):
                 return step(self.best, matches[0])

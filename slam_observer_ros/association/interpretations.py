@@ -66,15 +66,12 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    It is taken as it came, at no cost, where there is no joint covariance to judge it by.
     ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
     with the landmarks that its ids name. Points taken for landmarks not seen before get
     ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """
-    if not state.filter.has_joint_covariance:
-        return [Interpretation(event, 0.0)]
     # Which known landmarks are rejected, and which only pass as the state is uncertain.
     residuals, m = matched.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
@@ -124,8 +121,6 @@ def _without(
 def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
     residuals = matched.residuals
-    if not state.filter.has_joint_covariance:
-        return False
     sensor_distances = _sensor_distances(state, residuals)
     if not np.count_nonzero(sensor_distances > state.settings.rejection_threshold):
         return False  # by all of S they are no further off
@@ -136,7 +131,7 @@ def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
 def may_relabel(state: State, matched: MatchedObservation) -> bool:
     """Return whether a point's id may be that of a landmark which had none of its own so far."""
     all_are_known = len(matched.known.ids) == len(matched.rows) + matched.left_out
-    if all_are_known or not state.filter.has_joint_covariance:
+    if all_are_known:
         return False
     return bool(is_automatic(state.landmarks.ids).any())
 

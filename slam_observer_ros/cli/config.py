@@ -7,14 +7,17 @@ from collections.abc import Mapping
 import json
 import sys
 
-from slam_observer_ros.cli.completion import completed_by
 from slam_observer_ros.cli.options import config_files, find_config, named, shipped_names
+from slam_observer_ros.cli.shell import completed_by
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.common.input_files import not_special
-from slam_observer_ros.settings.dump import parameter_file_text
+from slam_observer_ros.common.files import not_special
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
-from slam_observer_ros.settings.parameter_file import names_of_others, read_parameter_file
+from slam_observer_ros.settings.parameter_file import (
+    names_of_others,
+    parameter_file_text,
+    read_parameter_file,
+)
 from slam_observer_ros.settings.parameter_table import Parameter, table, Value
 from slam_observer_ros.settings.schema import parameter_schema
 

@@ -9,7 +9,7 @@ import sys
 import threading
 from typing import TypeVar
 
-from slam_observer_ros.cli.interrupts import leaving_at_once
+from slam_observer_ros.cli.shell import leaving_at_once
 from slam_observer_ros.common.digits import json_text
 
 PROGRAM = 'slam-observer'

@@ -14,7 +14,7 @@ from slam_observer_ros.cli.outputs import (
     recording_path,
 )
 from slam_observer_ros.common.errors import OutputError
-from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
 from slam_observer_ros.recording.datasets.graph import load_graph
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam

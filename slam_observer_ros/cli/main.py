@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slam_observer_ros.cli.interrupts import leaving_at_once, SIGNALLED, stopping_once
+from slam_observer_ros.cli.shell import leaving_at_once, SIGNALLED, stopping_once
 
 with leaving_at_once():
     import argparse
@@ -17,8 +17,8 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
-    from slam_observer_ros.cli.completion import complete, typed_words
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
+    from slam_observer_ros.cli.shell import complete, typed_words
     from slam_observer_ros.common.errors import (
         IncompleteError,
         LossError,

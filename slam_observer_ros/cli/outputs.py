@@ -10,7 +10,7 @@ from pathlib import Path
 
 from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import EvaluationError, OutputError, UsageError
-from slam_observer_ros.common.output_files import destination, unfinished_directory
+from slam_observer_ros.common.files import destination, unfinished_directory
 
 
 def add_force_option(parser: argparse.ArgumentParser) -> None:

@@ -150,6 +150,12 @@ KINDS = {
         'ranges of {sensor} are to be multiplied by {found}',
         'set range_scale: {value:.4f}',
     ),
+    'depth_for_range': Kind(
+        Level.WARNING,
+        'the range looks like {looks}: off the axis it grows with the cosine to the power of '
+        '{power:.2f} ± {deviation:.2f}',
+        'set range_is_depth: {set_to}, or run slam-observer calibrate (Calibrate a sensor)',
+    ),
     'noisy_odometry': Kind(
         Level.WARNING,
         'the odometry is {factor:.1f} × noisier in {motion} than stated',

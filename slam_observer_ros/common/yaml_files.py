@@ -14,7 +14,7 @@ from typing import Any, Final
 import yaml
 
 from slam_observer_ros.common.errors import shown, YamlError
-from slam_observer_ros.common.input_files import not_special
+from slam_observer_ros.common.files import not_special
 
 MAX_LEVELS: Final = 30
 """How deep lists and mappings may be in each other; parameters and maps have less than ten."""

@@ -32,6 +32,7 @@ from slam_observer_ros.geometry.matrices import are_covariances, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.known_map.map_file import MAX_NUMBER
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
 from slam_observer_ros.state.landmark_table import LandmarkTable
 
@@ -328,7 +329,7 @@ def _check_definite(name: str, covariances: FloatArray) -> None:
 def usable_points(
     event: ObservationEvent,
     settings: Settings,
-    needs_ids: bool,
+    filter_: Filter,
     landmarks: LandmarkTable,
     counts: Counter[str],
     warnings: EventWarnings,
@@ -336,8 +337,9 @@ def usable_points(
     """Return an observation as the states use it; count its points, warn of those left out."""
     counts['observed_point'] += len(event.ids)
     event = flatten(event) if settings.two_d_mode else event
-    if event.orientations is not None and settings.use_tag_orientation:
-        event = replace(event, orientations=so3.exact(event.orientations))
+    if event.orientations is not None:
+        used = so3.exact(event.orientations) if filter_.estimates_orientations else None
+        event = replace(event, orientations=used)
     if (impossible := event.ids == IMPOSSIBLE_ID).any():
         warnings.warn('impossible_id', count=int(np.sum(impossible)))
         counts['impossible_id'] += int(np.sum(impossible))
@@ -354,11 +356,12 @@ def usable_points(
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
     unknown = event.ids == UNKNOWN_ID
-    if needs_ids and np.count_nonzero(unknown):
+    can_weigh = filter_.joint is not None
+    if not can_weigh and np.count_nonzero(unknown):
         warnings.warn('unknown_id', gains=settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)
-    elif not needs_ids and len(event.ids) > MAX_WEIGHED:
+    elif can_weigh and len(event.ids) > MAX_WEIGHED:
         warnings.many_points(len(event.ids))
         if unknown.any() or is_automatic(landmarks.ids).any():
             counts['unweighed_point'] += len(event.ids) - MAX_WEIGHED

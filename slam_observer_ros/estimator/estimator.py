@@ -544,9 +544,8 @@ class Estimator:
 
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings
-        needs_ids = not state.filter.has_joint_covariance
         usable = usable_points(
-            event, self.settings, needs_ids, state.landmarks, self._counts, warnings
+            event, self.settings, state.filter, state.landmarks, self._counts, warnings
         )
         event = self._timeline.synchronise(usable)
         if self._localiser.loaded is not None:
@@ -663,7 +662,7 @@ class Estimator:
         if unused := [name for name in self._state.filter.ignores if name in changed]:
             logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
         filter_ = self._state.filter
-        takes_points = filter_.has_joint_covariance and filter_.orientations is None
+        takes_points = filter_.has_joint_covariance and not filter_.estimates_orientations
         if settings.use_tag_orientation and takes_points:
             logger.warning(
                 'use_tag_orientation has no effect with landmark_velocity_stddev: landmarks are '

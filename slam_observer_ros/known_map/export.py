@@ -74,7 +74,7 @@ def _exact_map(state: State, rows: IntArray, loaded: LandmarkMap) -> LandmarkMap
 def _orientations_of(state: State, rows: IntArray) -> FloatArray | None:
     """Return orientations (m, 3, 3) in the world."""
     tags = state.filter.orientations
-    if tags is None or not tags.are_known[rows].any():
+    if not tags.are_known[rows].any():
         return None
     B = state.filter.orientation_matrices(rows)
     world: FloatArray = state.observer.reference_pose[:3, :3] @ B

@@ -30,7 +30,7 @@ import numpy as np
 import yaml
 
 from slam_observer_ros.common.errors import MapError, shown, YamlError
-from slam_observer_ros.common.output_files import destination, keep_copy, unfinished_file
+from slam_observer_ros.common.files import destination, keep_copy, unfinished_file
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.common.yaml_files import (

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from slam_observer_ros.common.errors import MapError, shown, YamlError
-from slam_observer_ros.common.input_files import read_text
+from slam_observer_ros.common.files import read_text
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.events import MAX_ID

@@ -11,7 +11,7 @@ import re
 import numpy as np
 
 from slam_observer_ros.common.errors import MapError
-from slam_observer_ros.common.input_files import read_text
+from slam_observer_ros.common.files import read_text
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.map_rows import (

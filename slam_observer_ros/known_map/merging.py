@@ -196,9 +196,7 @@ def _fix(state: State, known: LandmarkMap) -> None:
     rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
     exact = _in_reference_frame(state, known.select(rows))
     state.fix_landmarks(exact.points, exact.covariances)
-    R, sigmas, tags = exact.orientations, exact.sigmas, exact.tags
-    if state.filter.orientations is not None and R is not None and sigmas is not None:
-        state.filter.know_orientations(tags, R[tags], sigmas[tags])
+    state.filter.take_orientations(np.arange(len(exact)), exact)
 
 
 def _in_reference_frame(state: State, known: LandmarkMap) -> KnownLandmarks:

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from slam_observer_ros.common.errors import MapError, YamlError
-from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.geometry import se3, so3

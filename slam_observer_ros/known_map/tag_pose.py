@@ -30,7 +30,7 @@ class TagPose:
 def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> TagPose | None:
     """Return the pose in a map by the tag that says it best, but for ``refused`` ids; or None."""
     tags, R, sigmas = state.filter.orientations, known.orientations, known.orientation_sigmas
-    if tags is None or R is None or sigmas is None:
+    if R is None or sigmas is None:
         return None
     # Tags that both have, and that were seen the same way each time.
     rows, landmarks = state.landmarks.rows_of(known.ids), state.landmarks

@@ -8,6 +8,7 @@ import numpy as np
 
 from slam_observer_ros.common.columns import LandmarkColumns
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.observer.orientations import LandmarkOrientations
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 
 if TYPE_CHECKING:
@@ -19,7 +20,8 @@ class FilterArrays(LandmarkColumns):
 
     Only this folder writes to them; others read, and copy what they keep. Attributes are
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
-    each (n, 3), metres and m/s, and ``covariance``, P (N, N), empty for gains that know none.
+    each (n, 3), metres and m/s, the ``orientations`` of tags, and ``covariance``, P (N, N), empty
+    for gains that know none.
     ``have_moved`` says whether any landmark has had a velocity so far.
     """
 
@@ -33,6 +35,7 @@ class FilterArrays(LandmarkColumns):
         self.reference_pose: FloatArray = np.array(reference_pose)
         self.A: FloatArray = np.eye(4)
         self.covariance = SymmetricMatrix(np.zeros((0, 0)))
+        self.orientations = LandmarkOrientations()
         self.have_moved = False
 
     @property
@@ -45,4 +48,5 @@ class FilterArrays(LandmarkColumns):
         other = super().copy()
         other.reference_pose, other.A = self.reference_pose.copy(), self.A.copy()
         other.covariance = self.covariance.copy()
+        other.orientations = self.orientations.copy()
         return other

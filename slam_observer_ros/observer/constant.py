@@ -56,13 +56,12 @@ class ConstantFilter(Filter):
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
         self.calibration = Calibration(without_calibration(settings), self.axes)
-        self._is_fixed = False
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Integrate the innovation (30), (31) over the time since landmarks were seen before."""
         # The gains, and how long they act.
         settings, e, r = self._settings, residuals.e, residuals.r
-        gain_l = 0.0 if self._is_fixed else settings.gain_l
+        gain_l = 0.0 if self.is_exact else settings.gain_l
         k = np.full(len(r), settings.gain_k)
         step = paper_step if settings.step_mode == 'paper' else centroid_step
         dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)
@@ -74,11 +73,6 @@ class ConstantFilter(Filter):
         d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
         self.observer.correct(D, residuals.rows, d)
         return np.ones(len(k))
-
-    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Take all landmarks for exact: l is 0 from now on."""
-        super().fix_landmarks(y_ref, covariances)
-        self._is_fixed = True
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Put the known landmarks where they are known to be."""

@@ -6,7 +6,6 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.observer.constant import ConstantFilter
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
-from slam_observer_ros.observer.riccati.tag_filter import RiccatiTagFilter
 from slam_observer_ros.observer.scheduled.scheduled import ScheduledFilter
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -19,11 +18,5 @@ DESIGNS: dict[str, type[Filter]] = {
 
 
 def make_filter(settings: Settings, reference_pose: FloatArray) -> Filter:
-    """Return the filter that the setting ``gains`` names, at P° = ``reference_pose`` (4, 4).
-
-    Orientations of tags need a filter of their own, which takes landmarks to rest.
-    """
-    design = DESIGNS[settings.gains]
-    if settings.use_tag_orientation and settings.landmark_velocity_stddev == 0.0:
-        design = RiccatiTagFilter if design is RiccatiFilter else design
-    return design(settings, reference_pose)
+    """Return the filter that the setting ``gains`` names, at P° = ``reference_pose`` (4, 4)."""
+    return DESIGNS[settings.gains](settings, reference_pose)

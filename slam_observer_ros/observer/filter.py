@@ -20,8 +20,8 @@ from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.observer.configuration import turned_moment
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration, without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion, Passage
@@ -52,13 +52,15 @@ class Filter:
     joint: JointCovariance | None = None
     has_joint_covariance: ClassVar[bool] = False
     ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect on the filter
-    # Those of tags, where they are estimated; else only their positions are used.
-    orientations: LandmarkOrientations | None = None
+    # Whether orientations of tags are; else only their positions are used.
+    estimates_orientations: bool = False
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
         self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
+        self.orientations = self.observer.orientations  # of tags; none where not estimated
+        self.is_exact = False  # the map: no landmark is moved
         estimated = settings if self.has_joint_covariance else without_sensor_calibration(settings)
         self.calibration = Calibration(estimated, self.axes)  # of velocities and sensors
         self.motion_noise = MotionNoise(settings)
@@ -67,6 +69,7 @@ class Filter:
         """Return an independent copy."""
         other = copy(self)
         other.observer = self.observer.copy()
+        other.orientations = other.observer.orientations
         other.calibration = self.calibration.copy()
         other.motion_noise = self.motion_noise.copy()
         return other
@@ -78,26 +81,16 @@ class Filter:
         self.observer.propagate(motion.path)
         self.observer.move_landmarks(motion.duration_s)
 
-    def residuals(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        dt_s: FloatArray,
-        D: FloatArray | None = None,
-    ) -> Residuals:
-        """Return what landmarks ``rows`` (m,) seen at ``points`` (m, 3) say against X̂ (29).
+    def residuals(self, rows: IntArray, seen: SeenPoints, dt_s: FloatArray) -> Residuals:
+        """Return what landmarks ``rows`` (m,) say against X̂ (29).
 
-        Points and their ``covariances`` (m, 3, 3) are in the body frame, m and m²; ``dt_s`` (m,)
-        is the time since each was last seen, and D (m, 3, c) how points change with the
-        calibration, reference frame, None where they don't.
+        ``dt_s`` (m,) is the time since each was last seen.
         """
         # A filter that postpones moves of landmarks has made them for :meth:`expected_points`.
-        observer, joint = self.observer, self.joint
-        if joint is not None and not joint.is_dense:
-            joint.activate(rows)
-        e, r = observer.errors(rows, points)
-        return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s, D)
+        observer = self.observer
+        e, r = observer.errors(rows, seen.points)
+        R = observer.turned(seen.covariances)
+        return Residuals(rows, e, r, observer.a[rows], R, dt_s, seen.D)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
@@ -117,13 +110,13 @@ class Filter:
         """Take over orientations of which nothing is known yet, as they are seen."""
         raise NotImplementedError
 
-    def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
-        """Take in a map's orientations (m, 3, 3), reference frame, with ``sigmas`` (m,), rad."""
-        raise NotImplementedError
+    def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
+        """Take in what a map knows of the orientations of landmarks ``rows`` (m,), if it can."""
 
     def orientation_matrices(self, rows: IntArray) -> FloatArray:
         """Return orientations (m, 3, 3), reference frame, zero where none is known."""
-        raise NotImplementedError
+        B: FloatArray = self.orientations.B[rows]
+        return B
 
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
         """Return the standard deviations (m,) of orientations, rad."""
@@ -133,27 +126,21 @@ class Filter:
         """Let the calibration of the sensor of another frame be part of the state."""
         self.calibration.add_sensor(frame)
 
-    # Landmarks; D is as of residuals
+    # Landmarks
 
-    def add(
-        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
-    ) -> None:
-        """Append landmarks seen for the first time at ``points``."""
-        self.observer.add_landmarks(points)
+    def add(self, seen: SeenPoints) -> None:
+        """Append landmarks seen for the first time."""
+        self.observer.add_landmarks(seen.points)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks that a map knows, reference frame; their errors may be correlated."""
         self.observer.add_reference_landmarks(known.points)
+        n = len(self.observer)
+        self.take_orientations(np.arange(n - len(known), n), known)
 
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
-        """Take landmarks for new ones, seen for the first time at ``points``."""
-        self.observer.relocate_landmarks(rows, points)
+    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
+        """Take landmarks for new ones, seen for the first time."""
+        self.observer.relocate_landmarks(rows, seen.points)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``; those behind move up."""
@@ -162,6 +149,7 @@ class Filter:
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact and at rest at ``y_ref`` (n, 3), and never move them."""
         self.observer.fix_landmarks(y_ref)
+        self.is_exact = True
 
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
@@ -197,6 +185,7 @@ class Filter:
         self.anchor(rows, r, of_rows.covariances)
         self.observer.set_reference(self.observer.points)
         self.add_known(others)
+        self.take_orientations(rows, of_rows)
 
     # What is known of the errors
 

@@ -85,6 +85,7 @@ class Observer(FilterArrays):
 
     def add_reference_landmarks(self, y_ref: FloatArray) -> None:
         """Append landmarks with given y_i° (m, 3), metres, and â_i = 0."""
+        self.orientations.append_zeros(len(y_ref))
         rows = self.append_zeros(len(y_ref))
         self.y_ref[rows] = y_ref
 
@@ -92,10 +93,11 @@ class Observer(FilterArrays):
         """Put landmarks, at rest, where they are seen: y_i° = Â y_i with ``points`` y_i (m, 3)."""
         self.y_ref[rows] = se3.transform(self.A, points)
         self.a[rows] = self.u[rows] = 0.0
+        self.orientations.clear(rows)
 
     def fix_landmarks(self, y_ref: FloatArray) -> None:
         """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest."""
-        self.delete(np.arange(len(self)))
+        self.remove_landmarks(np.arange(len(self)))
         self.add_reference_landmarks(y_ref)
         self.have_moved = False
 
@@ -107,6 +109,7 @@ class Observer(FilterArrays):
     def remove_landmarks(self, rows: IntArray) -> None:
         """Delete the landmarks at ``rows``; those behind move up."""
         self.delete(rows)
+        self.orientations.delete(rows)
 
     def set_landmark_velocities(self, rows: IntArray, velocities: FloatArray) -> None:
         """Let landmarks move at ``velocities`` v_i (m, 3), m/s, body frame now, or rest (19)."""

@@ -7,7 +7,7 @@ from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from slam_observer_ros.common.errors import message_of, RecordingError, YamlError
-from slam_observer_ros.common.input_files import not_special
+from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.recording.compression import (
     decompressed,

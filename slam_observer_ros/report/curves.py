@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import average_nees_band, normalised_squared_errors
 from slam_observer_ros.evaluation.ellipses import CHI_SQUARE_95
-from slam_observer_ros.report.lists import Json, rounded
 from slam_observer_ros.runs.reported_run import ReportedRun
 
 MAX_GROUPS = 150
@@ -121,3 +122,15 @@ def drops(run: ReportedRun) -> list[Json]:
         {'reason': reason, 'count': [instant.dropped[reason] for instant in run.instants]}
         for reason in reasons
     ]
+
+
+Json: TypeAlias = Any
+"""What json.dumps takes without NaN."""
+
+
+def rounded(values: FloatArray, digits: int) -> list[Any]:
+    """Return nested lists, rounded, with None for what is not finite."""
+    numbers = np.round(np.asarray(values, dtype=np.float64), digits)
+    listed = numbers.astype(object)
+    listed[~np.isfinite(numbers)] = None
+    return list(listed.tolist())

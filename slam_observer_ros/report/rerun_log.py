@@ -13,7 +13,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from slam_observer_ros.common.output_files import destination, unfinished_directory
+from slam_observer_ros.common.files import destination, unfinished_directory
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import normalised_squared_errors
 from slam_observer_ros.evaluation.run_record import Instant

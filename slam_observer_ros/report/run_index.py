@@ -11,7 +11,7 @@ import re
 
 from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.errors import OutputError
-from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.report.page import asset
 
 

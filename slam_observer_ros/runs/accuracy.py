@@ -14,13 +14,12 @@ from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
-from slam_observer_ros.evaluation.gaps import filled
 from slam_observer_ros.evaluation.metrics import (
     landmark_errors,
     trajectory_errors,
     TrajectoryErrors,
 )
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.trajectory import filled, Trajectory
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth

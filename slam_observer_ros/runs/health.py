@@ -19,6 +19,7 @@ from slam_observer_ros.estimates import (
     DELAY_NAME,
     MotionFactor,
     point_share,
+    RangePower,
     UNUSED_POINTS,
     Update,
 )
@@ -49,6 +50,10 @@ WRONG_IDS = ('repeated_id', 'reserved_id', 'impossible_id')
 NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
 """Least delay of velocities that is worth a finding, and by how many of its deviations."""
 
+SHOWN, SURE = 0.25, 4.0
+"""Power of the cosine in ranges, over that of what they are taken for, that is worth a finding,
+and by how many of its deviations."""
+
 IMPLAUSIBLE = 4.0
 """Stated standard deviations by which no calibration is off: something else is wrong."""
 
@@ -58,6 +63,9 @@ NOTABLY_NOISIER = 1.5
 NOTABLY_WRONG, TOO_WRONG = math.sqrt(1.5), 2.0
 """Factors of the stated noise that are worth a note, and those that neither chance nor a sensor's
 usual correlation explains."""
+
+NOISELESS = 0.01
+"""Share of the stated noise below which there is none at all."""
 
 MOUNTED = {
     'sensor_rotation': (
@@ -189,6 +197,29 @@ def _mounting(part: CalibrationEstimate) -> Finding | None:
     )
 
 
+def of_ranges(power: RangePower | None, is_depth: bool) -> list[Finding]:
+    """Judge whether ranges are what they are taken for, ranges or depths along the axis.
+
+    What is estimated follows what they are taken for, so that only a part of the power is seen.
+    """
+    if power is None:
+        return []
+    # How far towards the other of the two.
+    off = 1.0 - power.value if is_depth else power.value
+    if off < max(SHOWN, SURE * power.deviation):
+        return []
+    looks, set_to = ('range, not depth', 'false') if is_depth else ('depth along the axis', 'true')
+    return [
+        found(
+            'depth_for_range',
+            looks=looks,
+            power=power.value,
+            deviation=power.deviation,
+            set_to=set_to,
+        )
+    ]
+
+
 def of_noise(factors: Iterable[MotionFactor]) -> list[Finding]:
     """Judge how noisy the odometry is: say what to state if it clearly is more than stated."""
     return [
@@ -206,9 +237,9 @@ def of_noise(factors: Iterable[MotionFactor]) -> list[Finding]:
 def of_fit(factor: float | None) -> list[Finding]:
     """Judge how many times as large as stated innovations are; None if that is not known.
 
-    Zero is that of sensors without any noise, as a simulation's may be.
+    Next to nothing is that of sensors without any noise, as a simulation's may be.
     """
-    if factor is None or factor == 0.0:
+    if factor is None or factor < NOISELESS:
         return []
     if factor > NOTABLY_WRONG:
         level = Level.WARNING if factor > TOO_WRONG else Level.NOTE

@@ -16,13 +16,14 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.estimates import Update, used_points
+from slam_observer_ros.estimates import RangePower, Update, used_points
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityBlock
+from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityBlock
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, Truth
+from slam_observer_ros.runs.range_power import RangeErrors
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -75,6 +76,8 @@ class Replay:
         CPU time of the estimator alone, without reading and measuring.
     start_ns : int
         Stamp of the first event that was used, nanoseconds; 0 if none was.
+    range_power : RangePower or None
+        How ranges grow with the cosine of the angle off the sensor's axis.
     localised_ns : (int, int) or None
         First and last stamp at which the pose in its final frame was known; None if it never was.
     events, observations, angular_velocities : int
@@ -96,6 +99,7 @@ class Replay:
     in_known_map: bool
     start_ns: int
     localised_ns: tuple[int, int] | None
+    range_power: RangePower | None
     observations: int
     angular_velocities: int
 
@@ -170,6 +174,7 @@ class _RunningReplay:
         self._dead_reckoning = DeadReckoning(self._keep_all)
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
+        self._ranges = RangeErrors(self._settings.two_d_mode)
         # Updates, with ids (n,) and positions (n, 3) of the landmarks, that await the truth.
         self._uncompared: list[tuple[Update, IntArray, FloatArray]] = []
         self._start_ns: int | None = None
@@ -190,6 +195,8 @@ class _RunningReplay:
 
     def _add_event(self, event: Event) -> None:
         self._events += 1
+        if isinstance(event, ObservationEvent):
+            self._ranges.note_event(event)
         start_s = time.thread_time()
         is_taken = self._estimator.add(event)
         self._seconds += time.thread_time() - start_s
@@ -219,6 +226,7 @@ class _RunningReplay:
             in_known_map=self._in_known_map,
             start_ns=self._start_ns or 0,
             localised_ns=self._localised_ns,
+            range_power=self._ranges.power,
             observations=self._observations,
             angular_velocities=self._angular_velocities,
         )
@@ -256,6 +264,8 @@ class _RunningReplay:
             self._updates.append(update)
         for recorder in self._recorders:
             recorder.note_update(update)
+        known, world_points = self._estimator.landmark_ids, self._estimator.world_points
+        self._ranges.note_update(update, known, world_points)
         self._count_observation()
         self._compare_with_truth(update)
 

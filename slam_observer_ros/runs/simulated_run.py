@@ -11,7 +11,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.decay import Decay, fit_decay
+from slam_observer_ros.evaluation.metrics import Decay, fit_decay
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.observer.innovation import lyapunov

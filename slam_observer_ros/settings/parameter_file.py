@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import json
 from pathlib import Path
 import re
+import textwrap
 
 from slam_observer_ros.common.errors import ParameterError, shown, YamlError
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
-from slam_observer_ros.settings.parameter_table import refuse_renamed, RENAMED, suggestion
+from slam_observer_ros.settings.parameter_table import (
+    Parameter,
+    suggestion,
+    Value,
+)
 
 OBSERVER_NODE = 'observer_node'
 
@@ -27,12 +33,11 @@ def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
     Raises
     ------
     ParameterError
-        If one is a former name of ours, or one of ours with a single mistake. With more of them
-        it may well be another node's: ``base_frame_id`` comes near, too.
+        If one is one of ours with a single mistake. With more of them it may well be another
+        node's: ``base_frame_id`` comes near, too.
 
     """
     others = [name for name in written if name not in ours]
-    refuse_renamed(name for name in others if RENAMED.get(name) in ours)
     for name in others:
         if near := suggestion(name, [our for our in ours if _is_misspelt(name, our)]):
             raise ParameterError(f"unknown parameter '{name}'{near}")
@@ -186,3 +191,27 @@ def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:
         else:
             flat[f'{prefix}{name}'] = value
     return flat
+
+
+WIDTH = 95
+
+
+def parameter_file_text(rows: Iterable[Parameter], values: Mapping[str, Value]) -> str:
+    """Return a parameter file with all parameters, at their defaults where ``values`` has none."""
+    lines = ['/**:', '  ros__parameters:']
+    for row in rows:
+        facts = ', '.join(fact for fact in (row.unit, row.range_text()) if fact)
+        comment = f'{row.description} ({facts})' if facts else row.description
+        lines += textwrap.wrap(comment, WIDTH, initial_indent='    # ', subsequent_indent='    # ')
+        lines.append(f'    {row.name}: {value_text(values.get(row.name, row.default))}')
+    return '\n'.join(lines) + '\n'
+
+
+def value_text(value: object) -> str:
+    """Return a value as YAML whose type ROS reads right: numbers with a point, as 1.0e-06."""
+    if isinstance(value, (tuple, list)):
+        return f'[{", ".join(value_text(entry) for entry in value)}]'
+    if isinstance(value, float):
+        mantissa, e, exponent = repr(value).partition('e')
+        return mantissa if not e else f'{mantissa}{"" if "." in mantissa else ".0"}e{exponent}'
+    return json.dumps(value, ensure_ascii=False)

@@ -20,23 +20,6 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
 
 
-RENAMED: dict[str, str] = {
-    'angular_bias_error': 'angular_bias_stddev',
-    'angular_scale_error': 'angular_scale_stddev',
-    'hindsight_interval': 'relinearization_interval',
-    'hindsight_turn': 'relinearization_angle',
-    'hindsight_window': 'smoothing_window',
-    'landmark_velocity_error': 'landmark_velocity_stddev',
-    'linear_bias_error': 'linear_bias_stddev',
-    'linear_scale_error': 'linear_scale_stddev',
-    'observation_error_time': 'observation_correlation_time',
-    'rejection_distance': 'rejection_threshold',
-    'stereo_focal_length': 'focal_length',
-    'velocity_delay_error': 'velocity_delay_stddev',
-}
-"""Former names of parameters, and what these are called now: old files are refused with it."""
-
-
 class Dataclass(Protocol):
     """What :func:`dataclasses.fields` takes."""
 
@@ -185,7 +168,6 @@ def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object
     """
     rows = {row.name: row for row in table(settings_class)}
     if unknown := sorted(set(values) - set(rows)):
-        refuse_renamed(unknown)
         raise ParameterError(f"unknown parameter '{unknown[0]}'{suggestion(unknown[0], rows)}")
     return settings_class(**{name: rows[name].check(value) for name, value in values.items()})
 
@@ -205,13 +187,6 @@ def changed_names(settings: Dataclass) -> list[str]:
     return [
         row.name for row in table(type(settings)) if getattr(settings, row.name) != row.default
     ]
-
-
-def refuse_renamed(names: Iterable[str]) -> None:
-    """Raise a ParameterError that gives the new name if one of the names is a former one."""
-    for name in names:
-        if name in RENAMED:
-            raise ParameterError(f"'{name}' is now '{RENAMED[name]}'")
 
 
 def suggestion(name: str, names: Collection[str]) -> str:

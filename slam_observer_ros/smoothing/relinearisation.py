@@ -84,7 +84,8 @@ class JointFilter(Protocol):
     calibration: Calibration
     axes: EstimatedAxes
     joint: JointCovariance | None
-    orientations: LandmarkOrientations | None
+    orientations: LandmarkOrientations
+    estimates_orientations: bool
 
 
 class Relinearisation:
@@ -327,9 +328,8 @@ class Relinearisation:
         self._calibration.shift(end.calibrations[-1] - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)
-        tags = self._filter.orientations
-        if tags is not None and end.orientations is not None:
-            tags.B[...] = end.orientations
+        if end.orientations is not None:
+            self._filter.orientations.B[...] = end.orientations
 
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
         calibration, sensed = self._calibration, None
@@ -367,8 +367,8 @@ class Relinearisation:
 
     def _orientations(self) -> FloatArray | None:
         """Return those of the landmarks (n, 3, 3), if they are estimated."""
-        tags = self._filter.orientations
-        return None if tags is None else tags.B.copy()
+        filter_ = self._filter
+        return filter_.orientations.B.copy() if filter_.estimates_orientations else None
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:

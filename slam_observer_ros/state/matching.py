@@ -10,7 +10,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
@@ -90,7 +90,7 @@ def residuals_of(
     D = None
     if event.sensed is not None:
         D = sensitivity(state, event, state.filter.expected_points(rows))
-    return state.filter.residuals(rows, event.points, covariances, dt_s, D)
+    return state.filter.residuals(rows, SeenPoints(event.points, covariances, D), dt_s)
 
 
 def keyframe_of(

@@ -13,6 +13,7 @@ from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
 from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
@@ -179,15 +180,9 @@ class State:
         if self.relinearisation is not None:
             self.relinearisation.add_calibration()
 
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        noise: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
-        """Take landmarks (m,) for new ones seen at ``points`` (m, 3), body frame."""
-        self.filter.relocate(rows, points, noise, D)
+    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
+        """Take landmarks (m,) for new ones."""
+        self.filter.relocate(rows, seen)
         if self.relinearisation is not None:
             self.relinearisation.relocate(rows)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
     corrected_again,
@@ -113,7 +113,7 @@ def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> Non
     state.counts['unmapped_landmark'] += new - m
     if m:
         event = corrected_again(state, event.select(np.arange(new) < m))
-        state.filter.add(event.points, noise[:m], sensitivity(state, event))
+        state.filter.add(SeenPoints(event.points, noise[:m], sensitivity(state, event)))
         state.landmarks.add(event.ids, event.stamp_ns)
 
 
@@ -127,8 +127,8 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
         moved_to = event.select(far)
-        D = sensitivity(state, moved_to)
-        state.relocate(rows[far], moved_to.points, noise[far], D)
+        seen = SeenPoints(moved_to.points, noise[far], sensitivity(state, moved_to))
+        state.relocate(rows[far], seen)
         state.landmarks.take_for_new(rows[far], event.stamp_ns)
         take_over_orientations(state, moved_to, rows[far])
     return event.ids[moved]

@@ -27,7 +27,7 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
     rejected leaves its landmark a point, as seen this time.
     """
     tags, event, rows = state.filter.orientations, matched.known, matched.residuals.rows
-    if tags is None or event.orientations is None or not len(rows):
+    if event.orientations is None or not len(rows):
         return matched
     gate = state.settings.rejection_threshold
     are_near = state.filter.distances(matched.residuals) <= gate
@@ -54,7 +54,7 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
     in a row.
     """
     tags, Z = state.filter.orientations, event.orientations
-    if tags is None or Z is None or state.is_fixed:
+    if Z is None or state.is_fixed:
         return
     in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     is_used = state.landmarks.rejections[rows] == 0
@@ -73,7 +73,7 @@ def seen_orientations(
     state: State, event: ObservationEvent, rows: IntArray
 ) -> SeenOrientations | None:
     """Return how tags of landmarks ``rows`` (m,) are turned, zero for none; None of points."""
-    if state.filter.orientations is None or event.orientations is None:
+    if event.orientations is None:
         return None
     seen = _all_seen(state, event, rows, event.orientations)
     if event.sensed is None or event.sensed.orientations is None:
@@ -121,7 +121,5 @@ def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:
     By that which is seen a tag that seems to be tilted would be trusted more than a frontal one.
     """
     tags = state.filter.orientations
-    if tags is None:
-        return Z
     expected: FloatArray = state.observer.A[:3, :3].T @ tags.B[rows]
     return np.where(tags.are_known[rows][:, None, None], expected, Z)

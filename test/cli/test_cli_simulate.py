@@ -6,7 +6,7 @@ from command_line import CommandLine
 import numpy as np
 import pytest
 
-from slam_observer_ros.evaluation.decay import fit_decay
+from slam_observer_ros.evaluation.metrics import fit_decay
 from slam_observer_ros.runs.simulated_run import LYAPUNOV_FLOOR
 
 PAPER_SLOPE = -2.0 * (1.0 / 4.0) / np.log(10.0)

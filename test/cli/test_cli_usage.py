@@ -16,7 +16,6 @@ import recordings
 
 import slam_observer_ros
 from slam_observer_ros.cli.options import find_config
-from slam_observer_ros.settings import parameter_table
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, '-m', 'slam_observer_ros.cli.main']
@@ -52,17 +51,6 @@ def test_help_names_what_a_robot_needs_first_before_the_advanced_parameters(
     output = slam_observer.succeed(command, '--help').output
     first, advanced = output.index('parameters that a robot needs first'), output.index('advanced')
     assert first < output.index('two_d_mode') < advanced < output.index('gain_k')
-
-
-def test_a_former_name_of_a_parameter_is_refused_with_the_new_one(
-    slam_observer, tmp_path, monkeypatch
-):
-    for old, new in (('gain_design', 'gains'), ('fiducial', 'tag_frame_prefix')):
-        monkeypatch.setitem(parameter_table.RENAMED, old, new)
-        path = tmp_path / 'robot.yaml'
-        path.write_text(f'/**: {{ros__parameters: {{{old}: constant, gain_k: 1.0}}}}')
-        for option in (('--config', path), ('--set', f'{old}=constant')):
-            assert f"'{old}' is now '{new}'" in slam_observer.fail('replay', 'a.mcap', *option)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from slam_observer_ros.common.output_files import (
+from slam_observer_ros.common.files import (
     destination,
     unfinished_directory,
     unfinished_file,
@@ -18,7 +18,7 @@ from slam_observer_ros.common.output_files import (
 WRITE_AND_WAIT = """\
 from pathlib import Path
 import sys
-from slam_observer_ros.common.output_files import unfinished_directory, unfinished_file
+from slam_observer_ros.common.files import unfinished_directory, unfinished_file
 folder = Path(sys.argv[1])
 with unfinished_file(folder / 'map.yaml') as file, unfinished_directory(folder) as directory:
     file.write('half')

@@ -77,7 +77,7 @@ def test_other_gains_use_the_position_and_say_so(gains, caplog):
 
 def test_landmarks_that_may_move_are_points_and_it_is_said(caplog):
     estimator = Estimator(replace(SETTINGS, landmark_velocity_stddev=0.1))
-    assert estimator._state.filter.orientations is None
+    assert not estimator._state.filter.estimates_orientations
     (message,) = caplog.messages
     assert message.startswith('use_tag_orientation has no effect')
     assert 'set landmark_velocity_stddev: 0.0' in message

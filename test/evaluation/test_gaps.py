@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from slam_observer_ros.evaluation.gaps import filled
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.trajectory import filled, Trajectory
 from slam_observer_ros.geometry import se3
 
 SECONDS = np.arange(0.0, 20.0, 0.1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam_observer_ros.evaluation.map_shape import shape_covariances
+from slam_observer_ros.evaluation.consistency import shape_covariances
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 

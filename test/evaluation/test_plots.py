@@ -18,8 +18,7 @@ from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import nees_over_time
-from slam_observer_ros.evaluation.decay import Decay, fit_decay
-from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.metrics import Decay, fit_decay, trajectory_errors
 from slam_observer_ros.evaluation.plots import map_plot, replay_plots, simulation_plots
 from slam_observer_ros.evaluation.plots.drawing import (
     BLACK,

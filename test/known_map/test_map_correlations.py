@@ -28,9 +28,9 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
-from slam_observer_ros.observer.riccati.tag_filter import RiccatiTagFilter
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -227,7 +227,9 @@ def mapped(rng, settings, n=8, design=RiccatiFilter):
     """A filter that has seen n landmarks, and moved."""
     flat = np.array([1.0, 1.0, not settings.two_d_mode])
     filter_ = design(settings, np.eye(4))
-    filter_.add(rng.uniform(-5.0, 5.0, (n, 3)) * flat, 0.01 * random_covariances(rng, n, 3))
+    filter_.add(
+        SeenPoints(rng.uniform(-5.0, 5.0, (n, 3)) * flat, 0.01 * random_covariances(rng, n, 3))
+    )
     for _ in range(4):
         random_step(filter_, rng, 1e-3, 1e-2)
     return filter_
@@ -435,7 +437,7 @@ class TestTags:
     @given(generators())
     def test_a_map_is_entered_as_by_a_kalman_filter_of_all_errors_together(self, two_d_mode, rng):
         settings = replace(PLAIN, use_tag_orientation=True, two_d_mode=two_d_mode)
-        filter_ = mapped(rng, settings, n=6, design=RiccatiTagFilter)
+        filter_ = mapped(rng, settings, n=6, design=RiccatiFilter)
         see_tags(rng, filter_, np.array([0, 1, 3]))
         # Of 3 both know how it is turned, of 0 and 1 the estimate alone, of 5 the map alone.
         rows, known = np.array([3, 1, 5, 0]), known_by_a_tag_map(rng, filter_)

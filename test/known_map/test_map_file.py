@@ -130,7 +130,7 @@ def test_a_map_that_cannot_be_written_leaves_the_older_one_alone(tmp_path, monke
     def full_disk(*_):
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr('slam_observer_ros.common.output_files.os.fsync', full_disk)
+    monkeypatch.setattr('slam_observer_ros.common.files.os.fsync', full_disk)
     with pytest.raises(MapError, match=r"can't write map .*map\.yaml: No space left"):
         write_map(path, a_map(4), Settings())
     assert len(read_map(path).ids) == 3

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 import struct
 
 import detector_messages as detector
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -489,18 +488,6 @@ class TestMalformed:
             DECODERS[key](raw + bytes(64), 0)
 
     @all_decoders
-    @settings(max_examples=40)
-    @given(data=st.data())
-    def test_flipped_bytes_never_raise_anything_else(self, key, data):
-        raw = bytearray(EXAMPLES[key[0]])
-        for _ in range(data.draw(st.integers(1, 3))):
-            raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
-        try:
-            DECODERS[key](bytes(raw), 0)
-        except MessageError as error:
-            assert str(error)
-
-    @all_decoders
     def test_a_thousand_mutations_never_raise_anything_else(self, key):
         """Lengths, numbers and texts that no publisher sends, in any place."""
         random = np.random.default_rng(list(key[0].encode()))
@@ -514,8 +501,10 @@ class TestMalformed:
                 raw[at : at + 4] = np.frombuffer(
                     word if isinstance(word, bytes) else word.to_bytes(4, 'little'), np.uint8
                 )
-            with suppress(MessageError):
+            try:
                 DECODERS[key](raw.tobytes(), 0)
+            except MessageError as error:
+                assert str(error)
 
     def test_other_encapsulations_are_refused(self):
         raw = b'\0\x03' + EXAMPLES['geometry_msgs/msg/Twist'][2:]

@@ -22,6 +22,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
@@ -30,7 +31,6 @@ from slam_observer_ros.observer.riccati.compressed_covariance import (
 )
 from slam_observer_ros.observer.riccati.panel_matrix import PanelMatrix
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
-from slam_observer_ros.observer.riccati.tag_filter import RiccatiTagFilter
 
 VIEW_M = 6.0
 
@@ -61,7 +61,7 @@ class SameReferences(RiccatiFilter):
     block = BlockSize(dense=10**9)
 
     def __init__(self, settings, compressed):
-        super(type(self), self).__init__(settings, np.eye(4))
+        super().__init__(settings, np.eye(4))
         self.compressed = compressed
 
     def propagate(self, motion):
@@ -71,24 +71,10 @@ class SameReferences(RiccatiFilter):
         self.joint.propagate(motion, points, self.observer.u)
 
 
-class CompressedTags(RiccatiTagFilter):
-    """The same of tags."""
-
-    block = Compressed.block
-
-
-class SameReferencesOfTags(RiccatiTagFilter):
-    """A dense filter of tags likewise."""
-
-    block = SameReferences.block
-    __init__, propagate = SameReferences.__init__, SameReferences.propagate
-
-
 def pair(settings):
     """The compressed filter and the dense one."""
-    are_tags = settings.use_tag_orientation
-    compressed = (CompressedTags if are_tags else Compressed)(settings, np.eye(4))
-    return compressed, (SameReferencesOfTags if are_tags else SameReferences)(settings, compressed)
+    compressed = Compressed(settings, np.eye(4))
+    return compressed, SameReferences(settings, compressed)
 
 
 class World:
@@ -139,7 +125,7 @@ class World:
                     filter_.correct_by_orientations(turns)
                 observe(filter_, rows, y, R[: len(known)])
             if len(new):
-                filter_.add(y_new, R[: len(new)])
+                filter_.add(SeenPoints(y_new, R[: len(new)]))
                 if self.are_tags:
                     filter_.add_orientations(turns_new)
         self.ids += new.tolist()
@@ -161,7 +147,7 @@ class World:
     def relocate(self, filters, rows):
         y = self.seen(np.array(self.ids)[rows])
         for filter_ in filters:
-            filter_.relocate(rows, y, 0.01 * np.eye(3)[None])
+            filter_.relocate(rows, SeenPoints(y, 0.01 * np.eye(3)[None]))
 
     def drive(self, filters, steps):
         for _ in range(steps):
@@ -171,7 +157,7 @@ class World:
 
 def assert_same(compressed, dense, tolerance=1e-9):
     rows = np.arange(len(dense.points))
-    if dense.orientations is not None:
+    if dense.estimates_orientations:
         B, sigmas = dense.orientations.B, dense.orientation_sigmas(rows)
         np.testing.assert_allclose(compressed.orientation_matrices(rows), B, atol=tolerance)
         np.testing.assert_allclose(compressed.orientation_sigmas(rows), sigmas, atol=tolerance)

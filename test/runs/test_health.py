@@ -60,7 +60,7 @@ def test_a_note_stands_behind_what_is_wrong():
     ('factor', 'found_so'),
     [
         (None, []),
-        (0.0, []),  # sensors without noise, as a simulation's may be
+        (1e-3, []),  # sensors without noise, as a simulation's may be
         (0.3, [('large_noise', Level.NOTE)]),
         (1.0, []),
         (1.5, [('small_noise', Level.NOTE)]),

@@ -13,7 +13,6 @@ import yaml
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.settings import parameter_table
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import (
     ManagedNodeSettings,
@@ -23,7 +22,6 @@ from slam_observer_ros.settings.node_settings import (
 from slam_observer_ros.settings.parameter_file import (
     misplaced_sections,
     mixed_lists,
-    names_of_others,
     read_parameter_file,
 )
 from slam_observer_ros.settings.parameter_table import from_parameters, parameter, table
@@ -170,28 +168,6 @@ def test_an_unknown_name_is_refused_with_the_one_that_may_be_meant(written, mean
 
 def test_where_no_name_is_near_none_is_suggested():
     assert error_text({'xyzzy': 1}, Settings) == "unknown parameter 'xyzzy'"
-
-
-@pytest.fixture
-def renamed(monkeypatch):
-    monkeypatch.setitem(parameter_table.RENAMED, 'gain_design', 'gains')
-
-
-def test_a_former_name_is_refused_with_the_new_one(renamed):
-    assert error_text({'gain_design': 'constant'}, Settings) == "'gain_design' is now 'gains'"
-
-
-def test_a_former_name_in_a_file_is_refused_by_the_node_that_had_it_only(renamed):
-    with pytest.raises(ParameterError, match=r"^'gain_design' is now 'gains'$"):
-        names_of_others(['exposure', 'gain_design'], [row.name for row in table(Settings)])
-    others = [row.name for row in table(Scenario)]
-    assert names_of_others(['gain_design'], others) == ['gain_design']
-
-
-def test_no_former_name_is_in_use_and_each_new_one_is():
-    names = {row.name for settings_class in TABLES for row in table(settings_class)}
-    assert not names & set(parameter_table.RENAMED)
-    assert names >= set(parameter_table.RENAMED.values())
 
 
 def test_what_a_robot_needs_first_is_about_a_dozen_of_each():

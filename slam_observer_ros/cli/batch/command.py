@@ -17,7 +17,10 @@ from slam_observer_ros.cli.batch.jobs import (
     Job,
     make_job,
     part_of,
+    REPORTS,
     shard_of,
+    TRAJECTORIES,
+    Work,
 )
 from slam_observer_ros.cli.batch.pool import cluster_pool, local_pool, Pool
 from slam_observer_ros.cli.batch.run_log import (
@@ -27,7 +30,6 @@ from slam_observer_ros.cli.batch.run_log import (
     read_logs,
     write_failures,
 )
-from slam_observer_ros.cli.batch.worker import REPORTS, TRAJECTORIES, Work
 from slam_observer_ros.cli.console import (
     muted_warnings,
     print_json,
@@ -40,7 +42,7 @@ from slam_observer_ros.cli.outputs import check_directory
 from slam_observer_ros.cli.replay.request import add_run_options, read_request
 from slam_observer_ros.cli.replay.summary import sha256_of
 from slam_observer_ros.common.errors import IncompleteError, OutputError
-from slam_observer_ros.common.output_files import destination
+from slam_observer_ros.common.files import destination
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)

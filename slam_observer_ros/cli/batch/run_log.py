@@ -20,7 +20,7 @@ from typing import Any
 from slam_observer_ros.cli.figures import FIGURES
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError
-from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.common.files import unfinished_file
 
 Line = dict[str, Any]
 

@@ -80,6 +80,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar='RECORDING',
         help='hold this one out, and take all of the other; may be given several times',
     )
+    parser.add_argument(
+        '--keep-noise',
+        action='store_true',
+        help='leave the noise of points as it is stated, which takes a third of the time',
+    )
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument(
         '-o',
@@ -114,7 +119,7 @@ def run(args: argparse.Namespace) -> None:
     material = read_material(request, share, survey)
     # What the settings that are tried give reason to warn of is nobody's concern.
     with muted_warnings(), shown_steps('calibrating') as advance:
-        found = Finder(material, request.settings, given.assigned, advance).find()
+        found = Finder(material, request.settings, given.assigned, advance).find(args.keep_noise)
         pose = _sensor_pose(request, found)
         stated = state_found(request.settings, request.inputs, found, pose)
         stated, verdict = _judged(request, args.hold_out, material, stated, found)

@@ -13,7 +13,7 @@ from slam_observer_ros.cli.calibrate.stated import Found
 from slam_observer_ros.cli.calibrate.trades import COMMON_SCALE, trades
 from slam_observer_ros.cli.tune.material import Material
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, of_points, scaled
-from slam_observer_ros.cli.tune.noise_search import search_noise
+from slam_observer_ros.cli.tune.search import search_noise
 from slam_observer_ros.cli.tune.verdict import judge, Judged, SURE
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.units import to_ns
@@ -55,7 +55,7 @@ class Finder:
         is_surveyed = material.landmark_map is not None
         self._open = opened(settings, kept, self._motion, is_surveyed)
 
-    def find(self) -> Found:
+    def find(self, keeps_noise: bool = False) -> Found:
         """Return what is found; a UsageError says if there is too little to see."""
         # As stated, but where a map is known: there no landmark is new.
         mode = self._open.localization_mode
@@ -69,7 +69,7 @@ class Finder:
             settings = replace(
                 settings, velocity_delay=0.0, velocity_delay_stddev=min(delay.deviation, 0.1)
             )
-        noise = self._noise(settings)
+        noise = [] if keeps_noise else self._noise(settings)
         settings = scaled(settings, [kind for kind, *_ in noise], [log for _, log, _ in noise])
         estimator, after = self._run(settings)
         # A filter seems to know what only shows where it has linearised: a common scale.

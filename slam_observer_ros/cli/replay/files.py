@@ -25,8 +25,7 @@ from slam_observer_ros.cli.replay.outcome import ReplayOutcome
 from slam_observer_ros.cli.replay.request import Records
 from slam_observer_ros.common.errors import EvaluationError, SlamObserverError, UsageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.consistency import nees_over_time
-from slam_observer_ros.evaluation.map_shape import shape_covariances
+from slam_observer_ros.evaluation.consistency import nees_over_time, shape_covariances
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.map_file import map_files, write_map

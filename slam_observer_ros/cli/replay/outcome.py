@@ -34,6 +34,7 @@ from slam_observer_ros.runs.health import (
     of_map,
     of_mounting,
     of_noise,
+    of_ranges,
     of_rejections,
 )
 from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
@@ -214,6 +215,7 @@ def _of_estimate(outcome: ReplayOutcome) -> Iterator[Finding]:
     yield from of_rejections(counts)
     yield from of_calibration(estimator.calibration)
     yield from of_mounting(estimator.calibration)
+    yield from of_ranges(result.range_power, estimator.settings.range_is_depth)
     yield from of_noise(estimator.motion_factors)
     nis = None if outcome.recorder is None else outcome.recorder.mean_nis
     yield from of_fit(None if nis is None else math.sqrt(nis))

@@ -11,7 +11,7 @@ from pathlib import Path
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.figures import ACCURACY_ROWS, figure_text
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.common.input_files import not_special
+from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors

@@ -17,8 +17,7 @@ from slam_observer_ros.cli.outputs import (
 from slam_observer_ros.cli.replay.request import add_input_options, read_request, ReplayRequest
 from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
 from slam_observer_ros.cli.tune.noise_kinds import kinds_of, NoiseKind, scaled
-from slam_observer_ros.cli.tune.noise_search import search_noise
-from slam_observer_ros.cli.tune.search import Found
+from slam_observer_ros.cli.tune.search import Found, search_noise
 from slam_observer_ros.cli.tune.tuned_file import certainty, rounded, verdict_lines, write_tuned
 from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
 from slam_observer_ros.common.errors import IncompleteError, UsageError

@@ -9,10 +9,10 @@ from pathlib import Path
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind
 from slam_observer_ros.cli.tune.verdict import Verdict
 from slam_observer_ros.common.errors import OutputError
-from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.version import VERSION
-from slam_observer_ros.settings.dump import value_text
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_file import value_text
 from slam_observer_ros.settings.parameter_table import Value
 
 DIGITS = 3

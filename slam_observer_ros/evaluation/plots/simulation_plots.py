@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.decay import Decay
+from slam_observer_ros.evaluation.metrics import Decay
 from slam_observer_ros.evaluation.plots.drawing import (
     BLACK,
     END,

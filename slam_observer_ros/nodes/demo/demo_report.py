@@ -10,8 +10,7 @@ from rich.console import Console
 from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.tables import table_of
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.decay import Decay, fit_decay
-from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.metrics import Decay, fit_decay, trajectory_errors
 from slam_observer_ros.evaluation.plots.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.nodes.demo.demo_listener import DemoListener

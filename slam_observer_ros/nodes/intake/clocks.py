@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from statistics import median_low
 import time
 from typing import TypeAlias
 
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.inputs.event_builder import Measured
 
 SAMPLES = 11
 """Messages whose median offset is looked at: five stragglers in a row change nothing."""
@@ -92,8 +92,8 @@ class ClockOffset:
         self.correction_ns = 0
 
 
-Received: TypeAlias = tuple[str, Measured, int]
-"""The name of an input, what it measures, and the time of its reception, nanoseconds."""
+Use: TypeAlias = Callable[[], None]
+"""Uses a message that was held."""
 
 AROUND_S = 0.5
 """How much earlier or later than /clock messages of its run may come, by a steady clock."""
@@ -110,7 +110,7 @@ class ClockChange:
     """
 
     def __init__(self) -> None:
-        self._held: list[Received] = []
+        self._held: list[Use] = []
         self._held_since_s = 0.0
         self._is_jumping = False
         self._jumped_s = -AROUND_S
@@ -127,37 +127,37 @@ class ClockChange:
         self._jumped_s = time.monotonic()
         self._back_ns = back_ns
 
-    def end(self) -> list[Received]:
+    def end(self) -> list[Use]:
         """Return what is of the next run, which is used from now on."""
         self._is_jumping = False
         return self._take()
 
-    def hold(self, received: Received, stamp_ns: int, usable_from_ns: int) -> bool:
+    def hold(self, use: Use, stamp_ns: int, receive_ns: int, usable_from_ns: int) -> bool:
         """Keep a message of the next run, or what may be one; return whether it is kept.
 
         ``stamp_ns`` is its stamp by /clock, ``usable_from_ns`` that before which it is too late.
         """
         if self._is_jumping:
-            is_next = not self._is_before_jump(stamp_ns, received[2])
+            is_next = not self._is_before_jump(stamp_ns, receive_ns)
         else:
             is_next = stamp_ns < usable_from_ns
         if not is_next or len(self._held) >= MAX_HELD:
             return False
         if not self._held:
             self._held_since_s = time.monotonic()
-        self._held.append(received)
+        self._held.append(use)
         return True
 
     def is_over(self, stamp_ns: int, receive_ns: int) -> bool:
         """Return whether a message is of the last run, and comes after its end."""
         return not self._is_jumping and self._is_before_jump(stamp_ns, receive_ns)
 
-    def take_overdue(self) -> list[Received]:
+    def take_overdue(self) -> list[Use]:
         """Return what was held for too long: the clock does not jump, it was just late."""
         is_overdue = self._held and time.monotonic() - self._held_since_s > AROUND_S
         return self._take() if is_overdue else []
 
-    def _take(self) -> list[Received]:
+    def _take(self) -> list[Use]:
         held, self._held = self._held, []
         return held
 

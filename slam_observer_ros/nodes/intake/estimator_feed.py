@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 import time
 
 from rclpy.node import Node
@@ -129,8 +130,8 @@ class EstimatorFeed:
 
     def end_clock_jump(self) -> None:
         """Use what has been kept."""
-        for received in self._change.end():
-            self._use(*received)
+        for use in self._change.end():
+            use()
 
     def _is_of_another_run(self, name: str, measured: Measured, receive_ns: int) -> bool:
         """Return whether a message is of before a jump of /clock, or waits for one."""
@@ -139,7 +140,8 @@ class EstimatorFeed:
             return False
         timed = with_receive_time(measured, receive_ns)
         stamp_ns = timed.stamp_ns + (clock.correction_ns if is_corrected else 0)
-        if self._change.hold((name, timed, receive_ns), stamp_ns, self._usable_from_ns):
+        use = partial(self._use, name, timed, receive_ns)
+        if self._change.hold(use, stamp_ns, receive_ns, self._usable_from_ns):
             return True
         if self._change.is_over(stamp_ns, receive_ns):
             self.dropped['last_run'] += 1
@@ -170,8 +172,8 @@ class EstimatorFeed:
 
     def retry(self) -> None:
         """Try again what waits for a transform, or for /clock to jump."""
-        for received in self._change.take_overdue():
-            self._use(*received)
+        for use in self._change.take_overdue():
+            use()
         self._give(self._builder.retry(time.monotonic_ns()), '')
 
     def clear(self) -> None:

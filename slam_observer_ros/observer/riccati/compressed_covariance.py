@@ -23,7 +23,6 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose
 from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.orientations import LandmarkOrientations
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.outside_landmarks import (
     Change,
@@ -44,7 +43,7 @@ REFERENCE_SHIFT_M = 0.1
 CHECK_INTERVAL = 20
 """Corrections in which that is looked at, of each landmark once."""
 
-CHANGE_INTERVAL = 32
+CHANGE_INTERVAL = 64
 """Corrections in which a change comes to all landmarks, if no other one has to begin before."""
 
 FOLDING = 3e7
@@ -67,21 +66,14 @@ class CompressedCovariance(JointCovariance):
     active: IntArray
     is_dense = False
 
-    def __init__(
-        self,
-        dense: JointCovariance,
-        observer: Observer,
-        size: BlockSize,
-        orientations: LandmarkOrientations | None = None,
-    ) -> None:
+    def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
         vars(self).update(vars(dense))
-        self.orientations = orientations  # of tags
         self._form, self._observer, self._size = copy(dense), observer, size
         self._form._matrix = SymmetricMatrix(self.P[: self.first, : self.first])
         n = len(observer.y_ref)
         self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
         self._set_active(np.arange(n), n)
-        self._outside = OutsideLandmarks(self._axes, self._stride, len(self.P))
+        self._outside = OutsideLandmarks(self.chart, len(self.P))
         # (n,) where each landmark is outside, −1 for nowhere; and (slots,) which ones are there
         self._slots = np.full(n, -1)
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
@@ -153,8 +145,12 @@ class CompressedCovariance(JointCovariance):
                 self._restart(self.active[:0])
                 return
             self._turn(number, X)
-        if self.orientations is not None:
+        if self.chart.turn:
             self._forget_gains()
+
+    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
+        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
+        return a + self.postponed_shifts(rows)
 
     def postponed_shifts(self, rows: IntArray) -> FloatArray:
         """Return how far the observer has yet to move landmarks (m, 3), metres."""
@@ -250,7 +246,7 @@ class CompressedCovariance(JointCovariance):
         return self.marginal(every).of_landmarks(at, points, of_tags)
 
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags will be once all is done."""
+        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
         every = np.tile(np.eye(3), (len(self._places), 1, 1))
         for view in self._views(np.unique(rows[self._places[rows] < 0])):
             every[view.rows] = view.turns
@@ -370,8 +366,8 @@ class CompressedCovariance(JointCovariance):
         rows, are_out = self._in_panel(number)
         moved = self._moved(number, rows, are_out)
         self._observer.a[rows[are_out]] += moved.shifts[are_out]
-        if self.orientations is not None:
-            self.orientations.turn(rows[are_out], moved.turns[are_out])
+        if self.chart.turn:
+            self._observer.orientations.turn(rows[are_out], moved.turns[are_out])
         self._outside.make(number, moved)
         self._changed += 1
 
@@ -419,12 +415,12 @@ class CompressedCovariance(JointCovariance):
 
     def _turn(self, number: int, X: FloatArray) -> None:
         """Turn the tags of a panel."""
-        if self.orientations is None:
+        if not self.chart.turn:
             return
         rows, are_out = self._in_panel(number)
         panel, each = self._outside.panels[number], X.reshape(len(rows), self._stride, -1)
         turns = self._postponed.turns(each[:, self._axes.point :], panel.turned, self._axes)
-        self.orientations.turn(rows[are_out], turns[are_out])
+        self._observer.orientations.turn(rows[are_out], turns[are_out])
         panel.turned = len(self._postponed.gains or [])
 
     def _forget_gains(self) -> None:
@@ -458,8 +454,6 @@ class CompressedCovariance(JointCovariance):
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]
         own = symmetric(to_x[:, columns] - to_x[:, :p] @ T.T)
-        outputs = np.eye(len(P))[:, columns]
-        outputs[:p] -= T.T
         kept = np.delete(np.arange(len(P)), columns)
         slots = all_slots[released]
         change = Change(
@@ -471,7 +465,8 @@ class CompressedCovariance(JointCovariance):
             slots,
             points,
             outside.rows(slots),
-            outputs,
+            columns,
+            T,
             own,
             to_x[:, kept],
         )
@@ -494,8 +489,8 @@ class CompressedCovariance(JointCovariance):
         slots, views = self._slots[rows], self._views(rows)
         X = np.concatenate([view.X for view in views]).reshape(len(rows) * self._stride, -1)
         self._observer.a[rows] += np.concatenate([view.shifts for view in views])
-        if self.orientations is not None:
-            self.orientations.turn(rows, np.concatenate([view.turns for view in views]))
+        if self.chart.turn:
+            self._observer.orientations.turn(rows, np.concatenate([view.turns for view in views]))
         among, XPsi = outside.among(slots, views), X @ postponed.Psi
         # ξ = η + T ε with x and with each other.
         T = self._all_turning(np.concatenate([view.references for view in views]))
@@ -552,7 +547,7 @@ class CompressedCovariance(JointCovariance):
         return blocks
 
     def _nothing_postponed(self) -> PostponedCorrection:
-        return PostponedCorrection(self.P, self._axes.point, self.orientations is not None)
+        return PostponedCorrection(self.P, self._axes.point, self.chart.turn > 0)
 
     def _columns(self, rows: IntArray) -> IntArray:
         return super()._columns(self._places[rows])

@@ -129,9 +129,13 @@ class JointCovariance:
         """Return the same with all landmarks in P."""
         return self
 
-    def postponed_shifts(self, rows: IntArray) -> FloatArray:
-        """Return how far landmarks (m, 3) have yet to be moved, metres."""
-        raise NotImplementedError
+    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
+        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
+        return a
+
+    def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
+        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
+        return B
 
     # The step
 

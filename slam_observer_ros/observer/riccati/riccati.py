@@ -19,7 +19,7 @@ from typing import ClassVar, TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     mahalanobis,
@@ -27,17 +27,18 @@ from slam_observer_ros.geometry.matrices import (
     with_blocks,
 )
 from slam_observer_ros.observer.chart import Chart
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
+from slam_observer_ros.observer.filter import OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CompressedCovariance,
 )
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.observer.robust import observation_weights
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -58,21 +59,23 @@ a thing have quite the same centre.
 """
 
 
-class RiccatiFilter(Filter):
+class RiccatiFilter(OrientationGains):
     """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
 
     joint: JointCovariance
     has_joint_covariance: ClassVar[bool] = True
     ignores = OF_CONSTANT_GAINS
     block = BlockSize()  # of large maps
-    estimates_orientations: ClassVar[bool] = False
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        # What is estimated of each landmark beside its position, and how little is known of it.
+        # What is estimated of each landmark beside its position, and how little is known of it:
+        # its velocity, or the orientation of a tag at rest.
+        speed = settings.landmark_velocity_stddev
+        self.estimates_orientations = settings.use_tag_orientation and not speed
+        velocity = self.axes.point if speed else 0
         turn = self.axes.turn if self.estimates_orientations else 0
-        velocity = self.axes.point if settings.landmark_velocity_stddev > 0.0 else 0
-        unknown = [UNKNOWN_RAD] * turn + [settings.landmark_velocity_stddev] * velocity
+        unknown = [UNKNOWN_RAD] * turn + [speed] * velocity
         self.joint = JointCovariance(
             Chart(self.axes, self.calibration.count, turn, velocity),
             self.observer.covariance,
@@ -93,6 +96,11 @@ class RiccatiFilter(Filter):
         points = observer.y_ref[active] + observer.a[active]
         self.joint.propagate(motion, points, observer.u[active])
         self.motion_noise.factors.move(motion.noise_by_kind)
+
+    def residuals(self, rows: IntArray, seen: SeenPoints, dt_s: FloatArray) -> Residuals:
+        """Return what landmarks (m,), which are going to correct the state, say against it."""
+        self.joint.activate(rows)
+        return super().residuals(rows, seen, dt_s)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
@@ -135,7 +143,7 @@ class RiccatiFilter(Filter):
 
     def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:
         # C as the prediction has it: in the middle between where landmarks are expected and seen.
-        C = self.axes.output_matrix(residuals.e - 0.5 * residuals.r + residuals.a)
+        C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
         self.motion_noise.factors.learn(r, S, C)
 
     def distances(self, residuals: Residuals) -> FloatArray:
@@ -162,14 +170,12 @@ class RiccatiFilter(Filter):
             self.joint.add_calibration(sensor.variances)
             self._compress_if_large(0)
 
-    def add(
-        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
-    ) -> None:
-        """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
-        self._compress_if_large(len(points))
-        super().add(points, covariances)
+    def add(self, seen: SeenPoints) -> None:
+        """Append landmarks seen for the first time."""
+        self._compress_if_large(len(seen.points))
+        super().add(seen)
         self.motion_noise.factors.forget_motion()  # until now, which is none of theirs
-        self.joint.add_seen(self.observer.turned(covariances), D)
+        self.joint.add_seen(self.observer.turned(seen.covariances), seen.D)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks whose errors are independent of all else, or only of all others."""
@@ -183,17 +189,11 @@ class RiccatiFilter(Filter):
         super().add_known(known)
         self._compress_if_large(0)
 
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
+    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
         self.joint.activate(rows)
-        super().relocate(rows, points, covariances)
-        self.joint.relocate(rows, self.observer.turned(covariances), D)
+        super().relocate(rows, seen)
+        self.joint.relocate(rows, self.observer.turned(seen.covariances), seen.D)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
@@ -218,7 +218,7 @@ class RiccatiFilter(Filter):
         self.joint = joint = self.joint.dense()
         k = self.axes.point
         G = joint.chart.gauge(len(self.observer))
-        J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
+        J = joint.chart.moved(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
         HP, HPH = joint.project(joint.chart.still(self.observer.points[rows]), rows)  # of −ã_i
         R = block_diagonal(covariances[:, :k, :k])
@@ -283,9 +283,6 @@ class RiccatiFilter(Filter):
         X = self.joint.chart.step(x).X
         return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a[rows])
 
-    def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
-        """Merge those of landmarks ``rows`` (m,) with the map's, which are at ``copies``."""
-
     @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
@@ -310,23 +307,18 @@ class RiccatiFilter(Filter):
     @property
     def points(self) -> FloatArray:
         """(n, 3) estimated landmarks, reference frame, metres."""
-        points = self.observer.points
-        if not self.joint.is_dense:
-            points += self.joint.postponed_shifts(np.arange(len(points)))
-        return points
+        observer = self.observer
+        return observer.y_ref + self.joint.followed(np.arange(len(observer)), observer.a)
 
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
-        if self.joint.is_dense:
-            return super().expected_points(rows)
         observer = self.observer
-        points = observer.y_ref[rows] + self.translations(rows)
-        return observer.in_body_frame(points)
+        y_ref, a = (of.take(rows, axis=0, mode='wrap') for of in (observer.y_ref, observer.a))
+        return observer.in_body_frame(y_ref + self.joint.followed(rows, a))
 
     def translations(self, rows: IntArray) -> FloatArray:
         """Return â_i (m, 3) of landmarks, metres."""
-        a = super().translations(rows)
-        return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
+        return self.joint.followed(rows, super().translations(rows))
 
     def _compress_if_large(self, added: int) -> None:
         """Go on with a covariance for many landmarks, unless they move."""
@@ -335,12 +327,9 @@ class RiccatiFilter(Filter):
         is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
         if self.joint.is_dense and is_large and not may_move:
-            self.joint = CompressedCovariance(
-                self.joint, self.observer, self.block, self.orientations
-            )
+            self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
-        """Move the state by exp(x)."""
         step, observer = self.joint.chart.step(x), self.observer
         self.calibration.shift(step.calibration)
         X, moved = step.X, self.joint.active  # none in an exact map
@@ -348,3 +337,5 @@ class RiccatiFilter(Filter):
         observer.correct(X.A, moved, X.a + turned)
         if step.velocities is not None:
             observer.correct_velocities(X.A, moved, step.velocities)
+        if step.turns is not None:
+            self.orientations.turn(moved, so3.exp(step.turns))

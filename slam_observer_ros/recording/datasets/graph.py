@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.common.errors import DataSetError, shown
-from slam_observer_ros.common.input_files import not_special
+from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.truth import LandmarkTruth

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.io
 
 from slam_observer_ros.common.errors import DataSetError, message_of
-from slam_observer_ros.common.input_files import not_special
+from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.truth import LandmarkTruth

@@ -1,4 +1,4 @@
-"""The Riccati filter for landmarks that may have orientations, as tags do.
+"""Riccati gains of landmarks that may have orientations, as tags do.
 
 The orientations seen correct it by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the coordinates of
 :mod:`.chart` that is H x with a constant H, too. Then the points do, as ever. Both noises
@@ -8,47 +8,30 @@ are taken to be independent, so to first order that is the same as both at once.
 
 from __future__ import annotations
 
-from typing import ClassVar, TYPE_CHECKING
-
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import (
     flip_verdicts,
-    LandmarkOrientations,
     SeenOrientations,
 )
-from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.robust import distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
-from slam_observer_ros.settings.estimator_settings import Settings
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 
-class RiccatiTagFilter(RiccatiFilter):
-    """Gains from the full covariance of pose, calibration, landmarks and their orientations."""
+class OrientationGains(Filter):
+    """What a filter with a joint covariance does with orientations, if it estimates them."""
 
-    orientations: LandmarkOrientations
-    estimates_orientations: ClassVar[bool] = True
+    joint: JointCovariance
 
-    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
-        super().__init__(settings, reference_pose)
-        self.orientations = LandmarkOrientations()
-        self._is_exact = False  # the map
-
-    def copy(self) -> Self:
-        """Return an independent copy."""
-        other = super().copy()
-        other.orientations = self.orientations.copy()
-        if isinstance(other.joint, CompressedCovariance):
-            other.joint.orientations = other.orientations
-        return other
+    def _move(self, x: FloatArray) -> None:
+        """Move the state by exp(x)."""
+        raise NotImplementedError
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Move the state by what is seen of known orientations.
@@ -84,10 +67,10 @@ class RiccatiTagFilter(RiccatiFilter):
 
     def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
         """Take in orientations of a map, whose errors are independent of all else."""
-        own = self.orientations.are_known[rows] & (not self._is_exact)
+        own = self.orientations.are_known[rows] & (not self.is_exact)
         new, seen = ~own, self._settings.max_rejections
         self.orientations.put_known(rows[new], B[new], sigmas[new], seen)
-        if self._is_exact:
+        if self.is_exact:
             return
         variances = np.maximum(sigmas, RESOLUTION_RAD)[:, None, None] ** 2
         R = variances * np.eye(self.axes.turn)
@@ -105,14 +88,11 @@ class RiccatiTagFilter(RiccatiFilter):
 
     def orientation_matrices(self, rows: IntArray) -> FloatArray:
         """Return B̂_i (m, 3, 3) of landmarks, zero for those that have none."""
-        B: FloatArray = self.orientations.B[rows]
-        if isinstance(self.joint, CompressedCovariance):
-            return self.joint.turned(rows, B)
-        return B
+        return self.joint.turned(rows, self.orientations.B[rows])
 
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
         """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
-        if self._is_exact:
+        if self.is_exact:
             return self.orientations.map_sigmas[rows]
         largest = np.linalg.eigvalsh(self.joint.own_turns(rows))[:, -1]
         return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
@@ -136,32 +116,10 @@ class RiccatiTagFilter(RiccatiFilter):
         apart = self.axes.turns(so3.log(R_hat @ seen.Z @ transpose(R_hat @ seen.flipped)))
         return flip_verdicts(evidence, distances(apart, np.zeros_like(predicted), R))
 
-    # Landmarks
-
-    def add(
-        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
-    ) -> None:
-        """Append landmarks seen for the first time, as yet without orientation."""
-        super().add(points, covariances, D)
-        self.orientations.append_zeros(len(points))
-
-    def add_known(self, known: KnownLandmarks) -> None:
-        """Append landmarks of a map, with the orientations that it knows."""
-        first = len(self.observer.y_ref)
-        super().add_known(known)
-        self.orientations.append_zeros(len(known))
-        self._take_orientations(first + np.arange(len(known)), known)
-
-    def enter_map(self, rows: IntArray, known: KnownLandmarks) -> None:
-        """Move the estimate to where a map has landmarks ``rows``, and append its others."""
-        super().enter_map(rows, known)
-        if known.joint is None:
-            self._take_orientations(rows, known.select(np.arange(len(rows))))
-
-    def _take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
+    def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
         """Take in what a map knows of the orientations of landmarks ``rows`` (m,)."""
         tags, R, sigmas = known.tags, known.orientations, known.sigmas
-        if R is None or sigmas is None:
+        if R is None or sigmas is None or not self.estimates_orientations:
             return
         if known.joint is None:
             self.know_orientations(rows[tags], R[tags], sigmas[tags])
@@ -172,6 +130,8 @@ class RiccatiTagFilter(RiccatiFilter):
     def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
         tags = self.orientations
         in_map, own = tags.are_known[copies], tags.are_known[rows]
+        if not in_map.any():
+            return
         # Those of which only the map knows, …
         new, of_new = rows[in_map & ~own], copies[in_map & ~own]
         self.joint.copy_turns(of_new, new)
@@ -187,33 +147,3 @@ class RiccatiTagFilter(RiccatiFilter):
             HP, HPH = self.joint.project_turn_differences(rows[agree], copies[agree])
             S = with_blocks(HPH, R[agree])
             self._move(-self.joint.update(HP, S, omega[agree].ravel()))
-
-    def relocate(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        D: FloatArray | None = None,
-    ) -> None:
-        """Take landmarks for new ones, without orientation."""
-        super().relocate(rows, points, covariances, D)
-        self.orientations.clear(rows)
-
-    def remove(self, rows: IntArray) -> None:
-        """Forget the landmarks at ``rows``."""
-        super().remove(rows)
-        self.orientations.delete(rows)
-
-    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Take all landmarks for exact, and their orientations."""
-        super().fix_landmarks(y_ref, covariances)
-        self._is_exact = True
-        self.orientations = LandmarkOrientations()  # until the map says what they are
-        self.orientations.append_zeros(len(y_ref))
-
-    def _move(self, x: FloatArray) -> None:
-        """Move the state by exp(x), and the orientations: B̂_i ← exp(ω_i) B̂_i."""
-        super()._move(x)
-        turns = self.joint.chart.step(x).turns
-        if turns is not None:
-            self.orientations.turn(self.joint.active, so3.exp(turns))

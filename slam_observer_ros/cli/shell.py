@@ -1,17 +1,15 @@
-"""Ctrl-C: it ends the program without a traceback, and clears away what there is, undisturbed.
-
-While libraries load, which takes a second, a KeyboardInterrupt comes out of some of them as
-another error, or aborts the process; and there is nothing yet to clear away.
-"""
+"""What a shell does with the program: signals end it, and it asks what completes a word."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import argparse
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import os
 import signal
 import time
 from types import FrameType
+from typing import Any
 
 SIGNALLED = 128
 """To which the number of the signal that ended the program is added, as shells do."""
@@ -62,3 +60,23 @@ def leaving_at_once() -> Iterator[None]:
 
 def _leave(number: int, _frame: FrameType | None) -> None:
     os._exit(SIGNALLED + number)
+
+
+def typed_words(environment: Mapping[str, str]) -> list[str] | None:
+    """Return the words after the program that a shell wants completed; None if it wants none."""
+    if '_ARGCOMPLETE' not in environment:
+        return None
+    return environment.get('COMP_LINE', '').split()[1:]
+
+
+def complete(parser: argparse.ArgumentParser) -> None:
+    """Write the completions and exit."""
+    import argcomplete  # which --help has no use for
+
+    argcomplete.autocomplete(parser)
+
+
+def completed_by(action: argparse.Action, completer: Callable[..., Sequence[str]]) -> None:
+    """Have an option's value completed by what a function returns, as argcomplete takes it."""
+    described: Any = action
+    described.completer = completer

@@ -1,8 +1,4 @@
-"""Files that are put where their name leads: whole or not at all, and over files only.
-
-They are written beside it, under names that nobody can guess or has taken, and locked: a file that
-nobody has locked is what a killed process has left, and goes when the next one is written.
-"""
+"""Files that are read, and files that are written: never half of one."""
 
 from __future__ import annotations
 
@@ -15,8 +11,39 @@ import os
 from pathlib import Path
 import secrets
 import shutil
+import stat
 import tempfile
 from typing import BinaryIO, TextIO
+
+_UTF16_MARKS = (b'\xff\xfe', b'\xfe\xff')
+
+
+def not_special(path: Path) -> Path:
+    """Return a path where a regular file or directory is; raise an OSError otherwise.
+
+    Reading a pipe or a device might never end.
+    """
+    mode = checked_name(path).stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, 'it is no regular file', str(path))
+    return path
+
+
+def read_text(path: Path) -> str:
+    """Return what is in a file, in UTF-8 or UTF-16 with or without mark, or else in Latin-1."""
+    content = not_special(path).read_bytes()
+    if content.startswith(_UTF16_MARKS):
+        return content.decode('utf-16', errors='replace')
+    try:
+        return content.decode('utf-8-sig')
+    except UnicodeDecodeError:  # as spreadsheets write it in Western Europe
+        return content.decode('latin-1')
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a file, as :func:`read_text` reads it."""
+    return read_text(path).splitlines()
+
 
 _MARK = '.unfinished-'
 _DIRECTORY_MARK = f'.slam_observer{_MARK}'
