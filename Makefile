@@ -32,8 +32,8 @@ help:  ## list these targets
 demo: $(READY) $(CORE)  ## run simulator and observer until they converge; pictures in demo_output/
 	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.demo
 
-robot: $(READY) $(CORE)  ## localise a simulated robot with a camera among AprilTags, as for Nav2
-	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.robot
+robot: $(READY) $(CORE)  ## localise a simulated robot among AprilTags, as for Nav2; OPTIONS=--help
+	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.robot $(OPTIONS)
 
 test: lint pytest colcon  ## everything that a change must pass
 

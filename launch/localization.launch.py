@@ -102,7 +102,7 @@ def generate_launch_description():
                 for name, (default, description) in ARGUMENTS.items()
             ),
             OpaqueFunction(function=check_file, args=['params_file']),
-            OpaqueFunction(function=check_optional_file, args=['map_file']),
+            OpaqueFunction(function=check_optional_file, args=['map_file', True]),
             OpaqueFunction(function=check_optional_file, args=['map']),
             OpaqueFunction(function=start),
         ]

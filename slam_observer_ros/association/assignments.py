@@ -18,6 +18,7 @@ import numpy as np
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     JointSearch,
+    Pairing,
     Pairs,
     pruning_cost,
     RESOLUTION,
@@ -44,6 +45,10 @@ from slam_observer_ros.state.state import State
 MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""
 
+HARDLY_MOVED = 0.5 * RESOLUTION
+"""How far an observation moves its points at most, in standard deviations of the sensor, where
+it does not matter which of them it takes for landmarks.
+"""
 
 UNCERTAIN = 3.0
 """How many times less well than the sensor measures it is known where an old landmark should be
@@ -96,10 +101,20 @@ def find_assignments(
     # Of the pairings that put the robot at one pose, the cheapest, which comes first.
     scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
     J = scale @ axes.output_matrix(seen.points)  # how a pose error moves the points, in σ
+
+    def moved(pairing: Pairing) -> FloatArray:
+        of_pose = PC[:, columns_of(pairing.chosen, axes.point)] @ (pairing.L.T @ pairing.z)
+        return np.asarray(J @ of_pose)
+
+    # Nearly always each point may be of one landmark, and all together hardly move the robot.
+    are_single = len(np.unique(at)) == len(np.unique(rows)) == len(at) > 0
+    whole = search.all_pairs() if are_single else None
+    if whole is not None and _largest(moved(whole)) <= HARDLY_MOVED:
+        return [Assignment(_taken(m, at, rows), whole.cost + fixed_cost)]
     assignments: list[Assignment] = []
     moves: list[FloatArray] = []
     for pairing in search.pairings():
-        move = J @ PC[:, columns_of(pairing.chosen, axes.point)] @ (pairing.L.T @ pairing.z)
+        move = moved(pairing)
         if all(_largest(move - other) > RESOLUTION for other in moves):
             taken = _taken(m, at[pairing.chosen], rows[pairing.chosen])
             assignments.append(Assignment(taken, pairing.cost + fixed_cost))
@@ -163,12 +178,13 @@ def _are_held_back(
         return held_back
     if np.count_nonzero(landmarks.are_new(state.confirmed, stamp_ns)) < MIN_LOOP:
         return held_back
+    residuals = residuals.select(may_be)
     noise = residuals.on(state.axes)[1]
     predicted = diagonal_blocks(state.filter.predicted(residuals)[1], noise.shape[1])
-    is_uncertain = np.trace(predicted, axis1=1, axis2=2) > UNCERTAIN**2 * np.trace(
+    held_back[may_be] = np.trace(predicted, axis1=1, axis2=2) > UNCERTAIN**2 * np.trace(
         noise, axis1=1, axis2=2
     )
-    return np.asarray(may_be & is_uncertain)
+    return held_back
 
 
 def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:

@@ -116,6 +116,23 @@ class JointSearch:
         self._options = [np.flatnonzero(pairs.points == point) for point in order]
         self._noise_log_dets = np.linalg.slogdet(pairs.noise)[1]
 
+    def all_pairs(self) -> Pairing | None:
+        """Return the pairing of all pairs; None if one of them is better left out.
+
+        No two of them have a point or a landmark in common.
+        """
+        pairs = self._pairs
+        q, k = pairs.residuals.shape
+        L = np.asarray(np.linalg.inv(cholesky(pairs.covariances)), dtype=np.float64)
+        z = L @ pairs.residuals.ravel()
+        log_dets = np.log(np.diagonal(L)).reshape(q, k).sum(axis=1)
+        rises = huber_loss(np.linalg.norm(z.reshape(q, k), axis=1)) - 2.0 * log_dets
+        rises -= self._noise_log_dets
+        cost = float(rises.sum())
+        if (rises > self._unpaired_costs).any() or cost > self._budget:
+            return None
+        return Pairing(cost, list(range(q)), L, z)
+
     def pairings(self) -> list[Pairing]:
         """Return the pairings, the cheapest first; points without a landmark are in no pair."""
         partial = [Pairing(0.0, [], np.empty((0, 0)), np.empty(0))]

@@ -79,8 +79,11 @@ class Visibility:
     def _has_moved(self, state: State) -> bool:
         """Return whether the robot is at another place than when it last was at another one."""
         A, last = state.observer.A, self._last_place
-        if last is not None and np.abs(se3.log(se3.inverse(last) @ A)).max() < MOVED_M:
-            return False
+        if last is not None:
+            motion = se3.inverse(last) @ A
+            turn = 0.5 * (motion[:3, :3] - motion[:3, :3].T)
+            if max(np.abs(motion[:3, 3]).max(), np.abs(turn).max()) < MOVED_M:
+                return False
         self._last_place = A.copy()
         return True
 

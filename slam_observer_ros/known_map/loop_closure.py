@@ -19,7 +19,7 @@ from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.known_map.constellation import find_places
 from slam_observer_ros.known_map.distances import MappedLandmarks
 from slam_observer_ros.known_map.merging import without_frame
-from slam_observer_ros.known_map.places import Anywhere, Constellation
+from slam_observer_ros.known_map.places import Anywhere, Constellation, Near
 from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.state import State
 
@@ -210,7 +210,9 @@ def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArr
     shape = root @ root.T + LEAST_M**2 * np.eye(m * k)
     seen = Constellation(points[new], shape, np.full(m, -1))
     error_probability = state.settings.localization_error_probability
-    places = find_places(known, seen, Anywhere(known), error_probability)
+    of_pose = state.filter.pose_covariance()
+    prior = Anywhere(known) if of_pose is None else Near(np.eye(4), of_pose, axes)
+    places = find_places(known, seen, prior, error_probability)
     place = places.decided(error_probability)
     if place is None or place.matches < MIN_LOOP:
         return None

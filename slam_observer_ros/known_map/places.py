@@ -140,8 +140,11 @@ class Places:
 class PlacePrior(Protocol):
     """What is known beforehand of where a constellation is."""
 
-    def log_density(self, transform: FloatArray) -> float:
-        """Return ln of the density at a transform (4, 4), over rad and m."""
+    def log_density(self, transform: FloatArray, covariance: FloatArray) -> float:
+        """Return ln of the density, over rad and m, at a transform (4, 4) that is uncertain.
+
+        ``covariance`` (p, p) is that of its turn and position on the axes that are estimated.
+        """
 
     @property
     def largest(self) -> float:
@@ -157,7 +160,7 @@ class Anywhere:
         turns = 2.0 * math.pi if axes.turn == 1 else 8.0 * math.pi**2
         self.largest = -float(np.log(sides_m).sum()) - math.log(turns)
 
-    def log_density(self, transform: FloatArray) -> float:
+    def log_density(self, transform: FloatArray, covariance: FloatArray) -> float:
         """Return ln of the density, which is the same everywhere."""
         return self.largest
 
@@ -167,17 +170,16 @@ class Near:
 
     def __init__(self, pose: FloatArray, covariance: FloatArray, axes: EstimatedAxes) -> None:
         self._pose, self._axes = pose, axes
-        P = covariance[axes.pose, axes.pose] + LEAST_STD**2 * np.eye(axes.p)
-        self._root = np.linalg.cholesky(P)
-        log_scale = float(np.log(np.diagonal(self._root)).sum())
-        self.largest = -log_scale - 0.5 * axes.p * math.log(2.0 * math.pi)
+        self._P = covariance[axes.pose, axes.pose] + LEAST_STD**2 * np.eye(axes.p)
+        self.largest = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * self._P)[1])
 
-    def log_density(self, transform: FloatArray) -> float:
-        """Return ln of the density at a transform (4, 4)."""
+    def log_density(self, transform: FloatArray, covariance: FloatArray) -> float:
+        """Return ln of the density: of the sum of both errors."""
         turn = so3.log(transform[:3, :3] @ self._pose[:3, :3].T)
         off = np.concatenate([turn, transform[:3, 3] - self._pose[:3, 3]])[self._axes.pose]
-        z = np.linalg.solve(self._root, off)
-        return self.largest - 0.5 * float(z @ z)
+        P = self._P + covariance
+        log_det = float(np.linalg.slogdet(2.0 * math.pi * P)[1])
+        return -0.5 * (float(off @ np.linalg.solve(P, off)) + log_det)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,15 +208,20 @@ class Weighing:
         some = known.points[:: max(1, len(known) // SAMPLED), :k]
         counts = known.tree.query_ball_point(some, self._view_m, return_length=True)
         self._fewest_in_view = int(np.min(counts))
+        self._at_best: dict[int, float] = {}
 
     def at_best(self, matches: int) -> float:
         """Return the largest mass that a place with so many matches may have, about."""
-        part = self._seen.select(np.arange(matches))
-        fit = self._fitted(np.eye(4), part, part.points, np.zeros_like(self._own[:matches]))
-        if fit is None:
-            return math.inf
-        in_view = max(matches, self._fewest_in_view)
-        return self._mass(fit.log_likelihood, matches, in_view) + self._prior.largest
+        if matches not in self._at_best:
+            part = self._seen.select(np.arange(matches))
+            fit = self._fitted(np.eye(4), part, part.points, np.zeros_like(self._own[:matches]))
+            in_view = max(matches, self._fewest_in_view)
+            self._at_best[matches] = (
+                math.inf
+                if fit is None
+                else self._mass(fit.log_likelihood, matches, in_view) + self._prior.largest
+            )
+        return self._at_best[matches]
 
     def place(self, transform: FloatArray, rows: IntArray) -> Place | None:
         """Fit a place to its matches, and weigh it; None if too few of these remain."""
@@ -232,7 +239,15 @@ class Weighing:
         centre = se3.transform(fit.transform, self._centre[None])[:, : known.axes.point]
         in_view = len(known.tree.query_ball_point(centre[0], self._view_m))
         mass = self._mass(fit.log_likelihood, n, max(n, in_view))
-        return Place(fit.transform, rows, mass + self._prior.log_density(fit.transform))
+        mass += self._prior.log_density(fit.transform, self._covariance(fit))
+        return Place(fit.transform, rows, mass)
+
+    def _covariance(self, fit: _Fit) -> FloatArray:
+        """Return the covariance (p, p) of a fit's turn and position."""
+        pose, J = self._known.axes.pose, np.eye(6)
+        J[3:, :3] = so3.hat(fit.centre - fit.transform[:3, 3])
+        J = J[pose, pose]
+        return np.asarray(J @ np.linalg.solve(fit.information, J.T))
 
     def _fit(self, transform: FloatArray, rows: IntArray) -> _Fit | None:
         """Fit a place to its matches (m,); None if these are too few."""

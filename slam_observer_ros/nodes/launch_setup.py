@@ -11,7 +11,7 @@ from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 from slam_observer_ros.nodes.message_classes import install_command
 
 
-def check_file(context: Any, name: str) -> None:
+def check_file(context: Any, name: str, may_be_folder: bool = False) -> None:
     """Expand ~ in the launch argument ``name``; raise a RuntimeError if there is no such file.
 
     Launch itself would only warn, and start the node with its defaults.
@@ -21,15 +21,15 @@ def check_file(context: Any, name: str) -> None:
         path = Path(written).expanduser().absolute()
     except RuntimeError as error:  # of a user that there is none of
         raise RuntimeError(f"{name}: no file '{written}': {error}") from error
-    if not path.is_file():
+    if not (path.is_file() or (may_be_folder and path.is_dir())):
         raise RuntimeError(f"{name}: no file '{path}'")
     context.launch_configurations[name] = str(path)
 
 
-def check_optional_file(context: Any, name: str) -> None:
+def check_optional_file(context: Any, name: str, may_be_folder: bool = False) -> None:
     """Do the same, unless the argument is empty."""
     if context.launch_configurations[name]:
-        check_file(context, name)
+        check_file(context, name, may_be_folder)
 
 
 def check_packages(*names: str) -> None:

@@ -1,4 +1,4 @@
-/* The usual step in C: the functions of step.py once more, in the same order and by the same names.
+/* The usual step in C: the functions of step.py once more, in that order and by the same names.
  *
  * advance() moves a state along velocities (27), observe() by the innovation (28)-(31), both on the
  * arrays of flat_arrays.py. Whatever is unusual returns UNUSUAL before anything is changed, and
@@ -39,59 +39,51 @@ static const long MAX_ROOM = 1 << 15;        /* rows of P: no product of sizes o
 
 static double larger(double a, double b) { return a > b ? a : b; }
 static double smaller(double a, double b) { return a < b ? a : b; }
-static double seconds(i64 later_ns, i64 earlier_ns) { return (double)(later_ns - earlier_ns) / 1e9; }
+static double seconds(i64 later_ns, i64 since_ns) { return (double)(later_ns - since_ns) / 1e9; }
 
 /* ------------------------------------------------------------------ vectors and 3 x 3 matrices */
 
-static double dot3(const double *a, const double *b)
-{
+static double dot3(const double *a, const double *b) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-static void hat(const double w[3], double K[9]) /* (7)  K v = w x v */
-{
+static void hat(const double w[3], double K[9]) { /* (7)  K v = w x v */
     K[0] = K[4] = K[8] = 0.0;
     K[1] = -w[2], K[2] = w[1];
     K[3] = w[2], K[5] = -w[0];
     K[6] = -w[1], K[7] = w[0];
 }
 
-static void times(const double A[9], const double B[9], double C[9])
-{
+static void times(const double A[9], const double B[9], double C[9]) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
             C[3 * i + j] = A[3 * i] * B[j] + A[3 * i + 1] * B[3 + j] + A[3 * i + 2] * B[6 + j];
 }
 
-static void times_transposed(const double A[9], const double B[9], double C[9]) /* A B' */
-{
+static void times_transposed(const double A[9], const double B[9], double C[9]) { /* A B' */
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
             C[3 * i + j] = dot3(A + 3 * i, B + 3 * j);
 }
 
-static void turn(const double R[9], const double v[3], double out[3]) /* R v */
-{
+static void turn(const double R[9], const double v[3], double out[3]) { /* R v */
     for (int i = 0; i < 3; i++)
         out[i] = dot3(R + 3 * i, v);
 }
 
-static void turn_back(const double R[9], const double v[3], double out[3]) /* R' v */
-{
+static void turn_back(const double R[9], const double v[3], double out[3]) { /* R' v */
     for (int i = 0; i < 3; i++)
         out[i] = R[i] * v[0] + R[3 + i] * v[1] + R[6 + i] * v[2];
 }
 
-static void turned_covariance(const double R[9], const double C[9], double out[9]) /* R C R' */
-{
+static void turned_covariance(const double R[9], const double C[9], double out[9]) { /* R C R' */
     double half[9];
     times(R, C, half);
     times_transposed(half, R, out);
 }
 
 /* exp(w) (Rodrigues) and the left Jacobian J, both polynomials in K = hat(w): so3.py */
-static void exp_and_jacobian(const double w[3], double R[9], double J[9])
-{
+static void exp_and_jacobian(const double w[3], double R[9], double J[9]) {
     double square = dot3(w, w) + ZERO_GUARD, half_angle = 0.5 * sqrt(square);
     double ratio = sin(half_angle) / half_angle;
     double a = ratio * cos(half_angle), b = 0.5 * ratio * ratio, c = (1.0 - a) / square;
@@ -105,8 +97,7 @@ static void exp_and_jacobian(const double w[3], double R[9], double J[9])
     }
 }
 
-static void normalise(double R[9]) /* R (3 I - R' R) / 2 */
-{
+static void normalise(double R[9]) { /* R (3 I - R' R) / 2 */
     double G[9], whole[9];
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
@@ -121,8 +112,7 @@ typedef struct {
     double R[9], x[3];
 } Pose;
 
-static Pose pose_of(const double A[16])
-{
+static Pose pose_of(const double A[16]) {
     Pose pose;
     for (int i = 0; i < 3; i++) {
         memcpy(pose.R + 3 * i, A + 4 * i, 3 * sizeof(double));
@@ -131,8 +121,7 @@ static Pose pose_of(const double A[16])
     return pose;
 }
 
-static void write_pose(const Pose *pose, double A[16])
-{
+static void write_pose(const Pose *pose, double A[16]) {
     for (int i = 0; i < 3; i++) {
         memcpy(A + 4 * i, pose->R + 3 * i, 3 * sizeof(double));
         A[4 * i + 3] = pose->x[i];
@@ -141,10 +130,9 @@ static void write_pose(const Pose *pose, double A[16])
     A[15] = 1.0;
 }
 
-/* ------------------------------------------------- Cholesky factors L of n x n matrices, in place */
+/* ---------------------------------------------- Cholesky factors L of n x n matrices, in place */
 
-static int factor(double *S, long n) /* returns 0 where S is not positive definite */
-{
+static int factor(double *S, long n) { /* returns 0 where S is not positive definite */
     for (long j = 0; j < n; j++) {
         double *row = S + j * n, square = row[j];
         for (long l = 0; l < j; l++)
@@ -162,8 +150,7 @@ static int factor(double *S, long n) /* returns 0 where S is not positive defini
     return 1;
 }
 
-static void solve_lower(const double *L, long n, double *b) /* L^-1 b */
-{
+static void solve_lower(const double *L, long n, double *b) { /* L^-1 b */
     for (long i = 0; i < n; i++) {
         for (long l = 0; l < i; l++)
             b[i] -= L[i * n + l] * b[l];
@@ -171,8 +158,7 @@ static void solve_lower(const double *L, long n, double *b) /* L^-1 b */
     }
 }
 
-static void solve_upper(const double *L, long n, double *b) /* L'^-1 b */
-{
+static void solve_upper(const double *L, long n, double *b) { /* L'^-1 b */
     for (long i = n - 1; i >= 0; i--) {
         b[i] /= L[i * n + i];
         for (long l = 0; l < i; l++)
@@ -180,8 +166,8 @@ static void solve_upper(const double *L, long n, double *b) /* L'^-1 b */
     }
 }
 
-static void solve_lower_rows(const double *L, long n, double *B, long width, long stride)
-{ /* L^-1 B, of which each row has ``width`` entries */
+/* L^-1 B, of which each row has ``width`` entries */
+static void solve_lower_rows(const double *L, long n, double *B, long width, long stride) {
     for (long i = 0; i < n; i++) {
         double *row = B + i * stride, inverse = 1.0 / L[i * n + i];
         for (long l = 0; l < i; l++) {
@@ -195,8 +181,7 @@ static void solve_lower_rows(const double *L, long n, double *B, long width, lon
 }
 
 /* The squared Mahalanobis distance of r (k) in a covariance (k x k); -1 if that is indefinite. */
-static double squared_distance(const double *r, const double *covariance, int k)
-{
+static double squared_distance(const double *r, const double *covariance, int k) {
     double L[9], z[3];
     memcpy(L, covariance, (size_t)(k * k) * sizeof(double));
     memcpy(z, r, (size_t)k * sizeof(double));
@@ -209,21 +194,19 @@ static double squared_distance(const double *r, const double *covariance, int k)
     return square;
 }
 
-static void copy_block(const double *S, long n, long i, int k, double *block)
-{
+static void copy_block(const double *S, long n, long i, int k, double *block) {
     for (int b = 0; b < k; b++)
         memcpy(block + b * k, S + (i * k + b) * n + i * k, (size_t)k * sizeof(double));
 }
 
-static double sum_of_squares(const double *z, long n)
-{
+static double sum_of_squares(const double *z, long n) {
     double sum = 0.0;
     for (long i = 0; i < n; i++)
         sum += z[i] * z[i];
     return sum;
 }
 
-/* --------------------------------------------- P, of which both triangles are kept: P += s U' V */
+/* -------------------------------------------- P, of which both triangles are kept: P += s U' V */
 
 enum { TALL = 4, WIDE = 64, MIRRORED = 32 };
 
@@ -237,8 +220,7 @@ enum { TALL = 4, WIDE = 64, MIRRORED = 32 };
 /* A block of TALL x WIDE entries at (i, j), which stays in registers for all rows of U and V. */
 FOR_EACH_PROCESSOR
 static void add_to_block(double *P, long room, const double *U, const double *V, long stride,
-                         long rank, double sign, long i, long j)
-{
+                         long rank, double sign, long i, long j) {
     double sums[TALL][WIDE];
     for (int t = 0; t < TALL; t++)
         memcpy(sums[t], P + (i + t) * room + j, sizeof sums[t]);
@@ -258,8 +240,7 @@ static void add_to_block(double *P, long room, const double *U, const double *V,
 
 FOR_EACH_PROCESSOR
 static void add_to_row(double *row, const double *V, long stride, const double *u, long rank,
-                       double sign, long first, long last)
-{
+                       double sign, long first, long last) {
     for (long q = 0; q < rank; q++) {
         const double *v = V + q * stride, factor = sign * u[q * stride];
         for (long j = first; j < last; j++)
@@ -270,8 +251,7 @@ static void add_to_row(double *row, const double *V, long stride, const double *
 /* Add s U' V, of rows (rank, stride), to the upper triangle of the first N rows and columns.
  * What that does to some of the lower one is undone by mirror(). */
 static void add_product(double *P, long room, long N, const double *U, const double *V,
-                        long stride, long rank, double sign)
-{
+                        long stride, long rank, double sign) {
     for (long j = 0; j < N; j += WIDE) {
         long end_j = j + WIDE < N ? j + WIDE : N;
         for (long i = 0; i < end_j; i += TALL) {
@@ -281,13 +261,13 @@ static void add_product(double *P, long room, long N, const double *U, const dou
                 continue;
             }
             for (long row = i; row < end_i; row++)
-                add_to_row(P + row * room, V, stride, U + row, rank, sign, row > j ? row : j, end_j);
+                add_to_row(P + row * room, V, stride, U + row, rank, sign, row > j ? row : j,
+                           end_j);
         }
     }
 }
 
-static void mirror(double *P, long room, long N) /* the upper triangle to the lower one */
-{
+static void mirror(double *P, long room, long N) { /* the upper triangle to the lower one */
     for (long i = 0; i < N; i += MIRRORED)
         for (long j = i; j < N; j += MIRRORED)
             for (long row = i; row < i + MIRRORED && row < N; row++)
@@ -295,335 +275,228 @@ static void mirror(double *P, long room, long N) /* the upper triangle to the lo
                     P[col * room + row] = P[row * room + col];
 }
 
-/* ------------------------------------------------- the door: tuples of arrays from flat_arrays.py */
+/* ---------------------------------------------- the door: tuples of arrays from flat_arrays.py */
 
-enum { MAX_ARRAYS = 48, ANY = -1 };
+enum { MAX_ARRAYS = 48, SIZES = 128, UNBOUND = -1 };
 
+/* Views of all arrays of a call, and the sizes that letters stand for in their shapes: what the
+ * first array with a letter has there, or what it was set to. */
 typedef struct {
     Py_buffer views[MAX_ARRAYS];
     int count;
+    Py_ssize_t sizes[SIZES];
 } Door;
 
-static void close_door(Door *door)
-{
+typedef char members_have_8_bytes[sizeof(void *) == 8 && sizeof(double) == 8 ? 1 : -1];
+
+static void open_door(Door *door) {
+    door->count = 0;
+    for (int letter = 0; letter < SIZES; letter++)
+        door->sizes[letter] = letter >= '0' && letter <= '9' ? letter - '0' : UNBOUND;
+    door->sizes['T'] = 13;
+}
+
+static void close_door(Door *door) {
     while (door->count)
         PyBuffer_Release(&door->views[--door->count]);
 }
 
-static int refuse(const char *what)
-{
-    PyErr_Format(PyExc_ValueError, "%s: not an array, or not of the shape that belongs here", what);
+static int refuse(const char *what) {
+    PyErr_Format(PyExc_ValueError, "%s: a part has not the type or shape that belongs here", what);
     return 0;
 }
 
-/* An array of float64 ('d'), int64 ('l') or bool ('?') with the given shape; NULL with an error. */
-static void *read_array(Door *door, PyObject *object, char kind, int writable, int ndim,
-                        const Py_ssize_t *shape, const char *what)
-{
-    int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (writable ? PyBUF_WRITABLE : 0);
-    if (door->count == MAX_ARRAYS) {
-        PyErr_SetString(PyExc_ValueError, "too many arrays");
-        return NULL;
-    }
-    Py_buffer *view = &door->views[door->count];
-    if (PyObject_GetBuffer(object, view, flags))
-        return NULL;
-    door->count++;
-    char format = view->format == NULL ? 'B' : view->format[0];
-    int is_kind = format == kind || (kind == 'l' && format == 'q');
-    Py_ssize_t itemsize = kind == '?' ? 1 : 8;
-    if (!is_kind || view->format[1] != '\0' || view->itemsize != itemsize || view->ndim != ndim) {
-        refuse(what);
-        return NULL;
-    }
-    for (int d = 0; d < ndim; d++)
-        if (shape[d] != ANY && view->shape[d] != shape[d]) {
-            refuse(what);
-            return NULL;
-        }
+/* The address of an array as ``spec`` describes it, a kind and its shape; NULL with an error. */
+static void *read_array(Door *door, PyObject *array, const char *spec, const char *what) {
     static double nothing; /* of an array without entries there may be no address */
-    return view->buf == NULL ? &nothing : view->buf;
+    char kind = spec[0] == 'D' ? 'd' : spec[0] == 'L' ? 'l' : spec[0];
+    int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (kind == spec[0] ? 0 : PyBUF_WRITABLE);
+    Py_buffer *view = &door->views[door->count];
+    if (door->count == MAX_ARRAYS || PyObject_GetBuffer(array, view, flags)) {
+        if (!PyErr_Occurred())
+            refuse(what);
+        return NULL;
+    }
+    door->count++;
+    const char *format = view->format == NULL ? "B" : view->format;
+    int is_fit = (format[0] == kind || (kind == 'l' && format[0] == 'q')) && format[1] == '\0'
+                 && view->itemsize == (kind == '?' ? 1 : 8) && view->ndim == (int)strlen(spec + 1);
+    for (int d = 0; is_fit && d < view->ndim; d++) {
+        Py_ssize_t *size = &door->sizes[(int)spec[1 + d]];
+        *size = *size == UNBOUND ? view->shape[d] : *size;
+        is_fit = view->shape[d] == *size;
+    }
+    if (!is_fit)
+        refuse(what);
+    return !is_fit ? NULL : view->buf == NULL ? &nothing : view->buf;
 }
 
-static Py_ssize_t length_of_last(const Door *door)
-{
-    return door->views[door->count - 1].shape[0];
+/* Read a tuple into a struct whose first members are its fields, 8 bytes each: by their specs, an
+ * int64 i, a number f, a truth b, or an array of float64 d, int64 l or bool ?, in capitals where
+ * it is written to; after ~ it may be None, and is NULL then. */
+static int read_fields(Door *door, PyObject *tuple, const char *const specs[], void *fields,
+                       const char *what) {
+    Py_ssize_t count = 0;
+    while (specs[count])
+        count++;
+    if (!PyTuple_Check(tuple) || PyTuple_GET_SIZE(tuple) != count)
+        return refuse(what);
+    for (Py_ssize_t i = 0; i < count; i++) {
+        PyObject *item = PyTuple_GET_ITEM(tuple, i);
+        const char *spec = specs[i] + (specs[i][0] == '~');
+        char *member = (char *)fields + 8 * i;
+        if (spec[0] == 'f') {
+            double number = PyFloat_AsDouble(item);
+            memcpy(member, &number, 8);
+        } else if (spec[0] == 'i' || spec[0] == 'b') {
+            i64 integer = spec[0] == 'i' ? PyLong_AsLongLong(item) : PyObject_IsTrue(item);
+            memcpy(member, &integer, 8);
+        } else {
+            int is_none = spec != specs[i] && item == Py_None;
+            void *address = is_none ? NULL : read_array(door, item, spec, what);
+            memcpy(member, &address, 8);
+        }
+        if (PyErr_Occurred())
+            return 0;
+    }
+    return 1;
 }
 
-#define SHAPE(...) ((const Py_ssize_t[]){__VA_ARGS__})
-#define READ(field, index, kind, ndim, shape) \
-    ((field) = read_array(door, PyTuple_GET_ITEM(tuple, index), kind, 0, ndim, shape, #field))
-#define WRITE(field, index, kind, ndim, shape) \
-    ((field) = read_array(door, PyTuple_GET_ITEM(tuple, index), kind, 1, ndim, shape, #field))
+static int is_stamp(i64 stamp_ns) { return -LATEST_NS < stamp_ns && stamp_ns < LATEST_NS; }
 
-static int is_tuple(PyObject *tuple, Py_ssize_t size, const char *what)
-{
-    if (PyTuple_Check(tuple) && PyTuple_GET_SIZE(tuple) == size)
-        return 1;
-    return refuse(what);
+static int are_within(const i64 *numbers, Py_ssize_t count, i64 most) {
+    for (Py_ssize_t j = 0; j < count; j++)
+        if (numbers[j] < 0 || numbers[j] > most)
+            return 0;
+    return 1;
 }
 
-static i64 read_int(PyObject *tuple, Py_ssize_t index)
-{
-    return PyLong_AsLongLong(PyTuple_GET_ITEM(tuple, index));
-}
-
-static double read_double(PyObject *tuple, Py_ssize_t index)
-{
-    return PyFloat_AsDouble(PyTuple_GET_ITEM(tuple, index));
-}
-
-static int is_stamp(i64 stamp_ns)
-{
-    return -LATEST_NS < stamp_ns && stamp_ns < LATEST_NS;
-}
+/* The structs begin with the fields of the tuples of that name, in their order. */
 
 typedef struct {
-    const double *A, *y_ref, *calibration, *drift;
+    const double *A, *y_ref;
     double *a, *P;
+    i64 N, first, is_planar;
+    const double *calibration;
     const i64 *estimated;
-    long n, room, N, first, c, c_v;
-    int is_planar, p, k, pose, turns; /* pose: which of the six axes of a twist comes first */
+    const double *drift;
+    long n, room, c, c_v;
+    int p, k, pose, turns; /* pose: which of the six axes of a twist comes first */
 } Estimate;
 
-static int read_estimate(Door *door, PyObject *tuple, Estimate *x)
-{
-    if (!is_tuple(tuple, 10, "Estimate"))
-        return 0;
-    x->N = (long)read_int(tuple, 4);
-    x->first = (long)read_int(tuple, 5);
-    x->is_planar = PyObject_IsTrue(PyTuple_GET_ITEM(tuple, 6));
-    if (PyErr_Occurred())
+static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
+    static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "b", "dT", "lv",
+                                        "dcc", NULL};
+    if (!read_fields(door, tuple, specs, x, "Estimate"))
         return 0;
     x->p = x->is_planar ? 3 : 6;
     x->k = x->is_planar ? 2 : 3;
     x->pose = x->is_planar ? 2 : 0;
     x->turns = x->is_planar ? 1 : 3;
-    x->c = x->first - x->p;
-    if (x->c < 0 || x->N < x->first || x->N > MAX_ROOM || (x->N - x->first) % x->k)
-        return refuse("size");
-    x->n = (x->N - x->first) / x->k;
-    if (!READ(x->A, 0, 'd', 2, SHAPE(4, 4)) || !READ(x->y_ref, 1, 'd', 2, SHAPE(x->n, 3))
-        || !WRITE(x->a, 2, 'd', 2, SHAPE(x->n, 3)) || !WRITE(x->P, 3, 'd', 2, SHAPE(ANY, ANY)))
-        return 0;
-    x->room = (long)length_of_last(door);
-    if (x->room < x->N || x->room > MAX_ROOM || door->views[door->count - 1].shape[1] != x->room)
-        return refuse("P");
-    if (!READ(x->calibration, 7, 'd', 1, SHAPE(13)) || !READ(x->estimated, 8, 'l', 1, SHAPE(ANY)))
-        return 0;
-    x->c_v = (long)length_of_last(door);
-    if (x->c_v > x->c)
-        return refuse("estimated");
-    for (long j = 0; j < x->c_v; j++)
-        if (x->estimated[j] < 0 || x->estimated[j] > 12)
-            return refuse("estimated");
-    return READ(x->drift, 9, 'd', 2, SHAPE(x->c, x->c)) != NULL;
+    x->n = (long)door->sizes['n'], x->room = (long)door->sizes['R'];
+    x->c = (long)door->sizes['c'], x->c_v = (long)door->sizes['v'];
+    door->sizes['p'] = x->p;
+    return (x->room <= MAX_ROOM && x->n <= MAX_ROOM && x->c <= MAX_ROOM && x->c_v <= x->c
+            && x->first == x->p + x->c && x->N == x->first + x->k * x->n && x->N <= x->room
+            && are_within(x->estimated, x->c_v, 12))
+           || refuse("Estimate");
 }
 
 typedef struct {
-    const i64 *stamps_ns, *since_ns;
+    const i64 *stamps_ns;
     const double *V;
+    const i64 *since_ns;
     const char *is_stated;
-    long count;
     double usual_s[2];
     i64 timeout_ns;
+    long count;
 } Velocities;
 
-static int read_velocities(Door *door, PyObject *tuple, Velocities *v)
-{
-    if (!is_tuple(tuple, 6, "Velocities") || !is_tuple(PyTuple_GET_ITEM(tuple, 4), 2, "usual_s"))
-        return 0;
-    if (!READ(v->stamps_ns, 0, 'l', 1, SHAPE(ANY)))
-        return 0;
-    v->count = (long)length_of_last(door);
-    /* The other columns have room for more. */
-    if (!READ(v->V, 1, 'd', 2, SHAPE(ANY, 6)) || length_of_last(door) < v->count
-        || !READ(v->since_ns, 2, 'l', 2, SHAPE(ANY, 2)) || length_of_last(door) < v->count
-        || !READ(v->is_stated, 3, '?', 2, SHAPE(ANY, 2)) || length_of_last(door) < v->count)
-        return PyErr_Occurred() ? 0 : refuse("Velocities");
-    v->usual_s[0] = read_double(PyTuple_GET_ITEM(tuple, 4), 0);
-    v->usual_s[1] = read_double(PyTuple_GET_ITEM(tuple, 4), 1);
-    v->timeout_ns = read_int(tuple, 5);
-    return !PyErr_Occurred();
-}
+static const char *const VELOCITIES[] = {"lr", "dr6", "lr2", "?r2", "f", "f", "i", NULL};
 
 typedef struct {
     i64 start_ns, end_ns, delay_ns, reach_ns;
     const double *at_start;
 } Interval;
 
-static int read_interval(Door *door, PyObject *tuple, Interval *interval)
-{
-    if (!is_tuple(tuple, 5, "Interval"))
-        return 0;
-    interval->start_ns = read_int(tuple, 0);
-    interval->end_ns = read_int(tuple, 1);
-    interval->delay_ns = read_int(tuple, 2);
-    interval->reach_ns = read_int(tuple, 3);
-    interval->at_start = NULL;
-    if (PyErr_Occurred())
-        return 0;
-    return PyTuple_GET_ITEM(tuple, 4) == Py_None
-           || READ(interval->at_start, 4, 'd', 1, SHAPE(6)) != NULL;
-}
+static const char *const INTERVAL[] = {"i", "i", "i", "i", "~d6", NULL};
 
 typedef struct {
     const double *densities, *scales, *factors;
 } MotionFigures;
 
-static int read_motion_figures(Door *door, PyObject *tuple, MotionFigures *figures)
-{
-    return is_tuple(tuple, 3, "MotionFigures") && READ(figures->densities, 0, 'd', 1, SHAPE(6))
-           && READ(figures->scales, 1, 'd', 1, SHAPE(6))
-           && READ(figures->factors, 2, 'd', 1, SHAPE(2));
-}
+static const char *const MOTION_FIGURES[] = {"d6", "d6", "d2", NULL};
 
 typedef struct {
     double *A, *noise, *of_turning, *F, *at_end, *variances;
 } Advanced;
 
-static int read_advanced(Door *door, PyObject *tuple, const Estimate *x, Advanced *out)
-{
-    return is_tuple(tuple, 6, "Advanced") && WRITE(out->A, 0, 'd', 2, SHAPE(4, 4))
-           && WRITE(out->noise, 1, 'd', 2, SHAPE(x->p, x->p))
-           && WRITE(out->of_turning, 2, 'd', 2, SHAPE(x->p, x->p))
-           && WRITE(out->F, 3, 'd', 2, SHAPE(x->p, x->c))
-           && WRITE(out->at_end, 4, 'd', 1, SHAPE(6))
-           && WRITE(out->variances, 5, 'd', 1, SHAPE(6));
-}
+static const char *const ADVANCED[] = {"D44", "Dpp", "Dpp", "Dpc", "D6", "D6", NULL};
 
 typedef struct {
     const i64 *sorted_ids, *order;
     i64 *counts, *rejections, *last_seen_ns, *seen_before_ns;
 } Landmarks;
 
-static int read_landmarks(Door *door, PyObject *tuple, long n, Landmarks *table)
-{
-    return is_tuple(tuple, 6, "Landmarks") && READ(table->sorted_ids, 0, 'l', 1, SHAPE(n))
-           && READ(table->order, 1, 'l', 1, SHAPE(n)) && WRITE(table->counts, 2, 'l', 1, SHAPE(n))
-           && WRITE(table->rejections, 3, 'l', 1, SHAPE(n))
-           && WRITE(table->last_seen_ns, 4, 'l', 1, SHAPE(n))
-           && WRITE(table->seen_before_ns, 5, 'l', 1, SHAPE(n));
-}
+static const char *const LANDMARKS[] = {"ln", "ln", "Ln", "Ln", "Ln", "Ln", NULL};
 
 typedef struct {
     i64 stamp_ns;
-    const i64 *ids, *of_sensor;
+    const i64 *ids;
     const double *arms, *origins, *covariances, *sensor;
-    long m, c_s, column;
+    const i64 *of_sensor;
+    i64 column;
+    long m, c_s;
 } Seen;
 
-static int read_seen(Door *door, PyObject *tuple, const Estimate *x, Seen *seen)
-{
-    if (!is_tuple(tuple, 8, "Seen"))
+static int read_seen(Door *door, PyObject *tuple, const Estimate *x, Seen *seen) {
+    static const char *const specs[] = {"i", "lm", "dm3", "~dm3", "~dm33", "~d7", "ls", "i", NULL};
+    if (!read_fields(door, tuple, specs, seen, "Seen"))
         return 0;
-    seen->stamp_ns = read_int(tuple, 0);
-    seen->column = (long)read_int(tuple, 7);
-    if (PyErr_Occurred() || !READ(seen->ids, 1, 'l', 1, SHAPE(ANY)))
-        return 0;
-    seen->m = (long)length_of_last(door);
-    seen->origins = seen->covariances = seen->sensor = NULL;
-    if (!READ(seen->arms, 2, 'd', 2, SHAPE(seen->m, 3)))
-        return 0;
-    if (PyTuple_GET_ITEM(tuple, 3) != Py_None
-        && !READ(seen->origins, 3, 'd', 2, SHAPE(seen->m, 3)))
-        return 0;
-    if (PyTuple_GET_ITEM(tuple, 4) != Py_None
-        && !READ(seen->covariances, 4, 'd', 3, SHAPE(seen->m, 3, 3)))
-        return 0;
-    if (PyTuple_GET_ITEM(tuple, 5) != Py_None && !READ(seen->sensor, 5, 'd', 1, SHAPE(7)))
-        return 0;
-    if (!READ(seen->of_sensor, 6, 'l', 1, SHAPE(ANY)))
-        return 0;
-    seen->c_s = (long)length_of_last(door);
-    if (seen->sensor == NULL)
-        seen->c_s = 0;
-    if (seen->column < 0 || seen->column > x->c || seen->c_s > x->c - seen->column)
-        return refuse("of_sensor");
-    for (long j = 0; j < seen->c_s; j++)
-        if (seen->of_sensor[j] < 0 || seen->of_sensor[j] > 6)
-            return refuse("of_sensor");
-    return 1;
+    seen->m = (long)door->sizes['m'];
+    seen->c_s = seen->sensor == NULL ? 0 : (long)door->sizes['s'];
+    door->sizes['o'] = seen->covariances == NULL ? 0 : seen->m;
+    return (seen->column >= 0 && seen->column <= x->c && seen->c_s <= x->c - seen->column
+            && are_within(seen->of_sensor, seen->c_s, 6))
+           || refuse("Seen");
 }
 
 typedef struct {
     double along_0, along_2, along_4, across_0, across_2;
 } PointFigures;
 
-static int read_point_figures(PyObject *tuple, PointFigures *figures)
-{
-    if (!is_tuple(tuple, 5, "PointFigures"))
-        return 0;
-    figures->along_0 = read_double(tuple, 0);
-    figures->along_2 = read_double(tuple, 1);
-    figures->along_4 = read_double(tuple, 2);
-    figures->across_0 = read_double(tuple, 3);
-    figures->across_2 = read_double(tuple, 4);
-    return !PyErr_Occurred();
-}
+static const char *const POINT_FIGURES[] = {"f", "f", "f", "f", "f", NULL};
 
 typedef struct {
     double gate, huber, error_time_s;
-    i64 confirmations, max_rejections;
-    int weighs_meanings;
+    i64 confirmations, max_rejections, weighs_meanings;
 } Limits;
 
-static int read_limits(PyObject *tuple, Limits *limits)
-{
-    if (!is_tuple(tuple, 6, "Limits"))
-        return 0;
-    limits->gate = read_double(tuple, 0);
-    limits->huber = read_double(tuple, 1);
-    limits->error_time_s = read_double(tuple, 2);
-    limits->confirmations = read_int(tuple, 3);
-    limits->max_rejections = read_int(tuple, 4);
-    limits->weighs_meanings = PyObject_IsTrue(PyTuple_GET_ITEM(tuple, 5));
-    return !PyErr_Occurred();
-}
+static const char *const LIMITS[] = {"f", "f", "f", "i", "i", "b", NULL};
 
 typedef struct {
-    int are_there;
     const double *shares;
     double *logs, *information, *applied, least;
+    int are_there;
 } Factors;
 
-static int read_factors(Door *door, PyObject *tuple, int p, Factors *factors)
-{
-    factors->are_there = tuple != Py_None;
-    if (!factors->are_there)
-        return 1;
-    if (!is_tuple(tuple, 5, "Factors"))
-        return 0;
-    factors->least = read_double(tuple, 4);
-    return !PyErr_Occurred() && READ(factors->shares, 0, 'd', 3, SHAPE(2, p, p))
-           && WRITE(factors->logs, 1, 'd', 1, SHAPE(2))
-           && WRITE(factors->information, 2, 'd', 2, SHAPE(2, 2))
-           && WRITE(factors->applied, 3, 'd', 1, SHAPE(2));
-}
+static const char *const FACTORS[] = {"d2pp", "D2", "D22", "D2", "f", NULL};
 
 typedef struct {
-    double *A, *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *shift;
-    double *judged;
+    double *A;
     i64 *rows;
+    double *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *shift, *judged;
     int judges;
 } Observed;
 
-static int read_observed(Door *door, PyObject *tuple, const Estimate *x, const Seen *seen,
-                         Observed *out)
-{
-    Py_ssize_t m = seen->m, stated = seen->covariances == NULL ? 0 : m;
-    if (!is_tuple(tuple, 11, "Observed") || !WRITE(out->A, 0, 'd', 2, SHAPE(4, 4))
-        || !WRITE(out->rows, 1, 'l', 1, SHAPE(m)) || !WRITE(out->points, 2, 'd', 2, SHAPE(m, 3))
-        || !WRITE(out->r, 3, 'd', 2, SHAPE(m, 3)) || !WRITE(out->weights, 4, 'd', 1, SHAPE(m))
-        || !WRITE(out->origins, 5, 'd', 2, SHAPE(m, 3))
-        || !WRITE(out->lines_of_sight, 6, 'd', 2, SHAPE(m, 3))
-        || !WRITE(out->covariances, 7, 'd', 3, SHAPE(stated, 3, 3))
-        || !WRITE(out->dt_s, 8, 'd', 1, SHAPE(m)) || !WRITE(out->shift, 9, 'd', 1, SHAPE(x->c))
-        || !WRITE(out->judged, 10, 'd', 1, SHAPE(ANY)))
+static int read_observed(Door *door, PyObject *tuple, Observed *out) {
+    static const char *const specs[] = {"D44", "Lm",   "Dm3", "Dm3", "Dm", "Dm3",
+                                        "Dm3", "Do33", "Dm",  "Dc",  "Dj", NULL};
+    if (!read_fields(door, tuple, specs, out, "Observed"))
         return 0;
-    Py_ssize_t judged = length_of_last(door);
+    Py_ssize_t judged = door->sizes['j'];
     out->judges = judged > 0;
-    return judged == 0 || judged == 3 * m + 1 ? 1 : refuse("judged");
+    return judged == 0 || judged == 3 * door->sizes['m'] + 1 || refuse("Observed");
 }
 
 /* ---------------------------------------------------------------------------- a motion: (27) */
@@ -636,8 +509,7 @@ typedef struct {
     int moves;
 } Piece;
 
-static long rows_up_to(const i64 *stamps_ns, long count, i64 stamp_ns, int and_at) /* bisection */
-{
+static long rows_up_to(const i64 *stamps_ns, long count, i64 stamp_ns, int and_at) { /* bisection */
     long low = 0, high = count;
     while (low < high) {
         long middle = low + (high - low) / 2;
@@ -649,22 +521,19 @@ static long rows_up_to(const i64 *stamps_ns, long count, i64 stamp_ns, int and_a
     return low;
 }
 
-static void only_counting(double V[6], int is_planar)
-{
+static void only_counting(double V[6], int is_planar) {
     if (is_planar)
         V[0] = V[1] = V[5] = 0.0;
 }
 
-static int moves(const double V[6])
-{
+static int moves(const double V[6]) {
     for (int j = 0; j < 6; j++)
         if (V[j] != 0.0)
             return 1;
     return 0;
 }
 
-static void calibrated(const Estimate *x, const double V[6], double out[6]) /* (1 + s) V + b */
-{
+static void calibrated(const Estimate *x, const double V[6], double out[6]) { /* (1 + s) V + b */
     int is_moving = moves(V);
     for (int j = 0; j < 6; j++)
         out[j] = V[j] * x->calibration[j] + (is_moving ? x->calibration[6 + j] : 0.0);
@@ -672,8 +541,7 @@ static void calibrated(const Estimate *x, const double V[6], double out[6]) /* (
 
 /* Fill in pieces [first, last); 0 for gaps, and where velocities have covariances of their own. */
 static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns, i64 end_ns,
-                       int is_planar, Piece *pieces)
-{
+                       int is_planar, Piece *pieces) {
     for (long row = first; row < last; row++) {
         Piece *piece = &pieces[row - first];
         const i64 *since_ns = v->since_ns + 2 * row;
@@ -693,8 +561,7 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
     return 1;
 }
 
-static void sum_up(Piece *pieces, long k)
-{
+static void sum_up(Piece *pieces, long k) {
     double until_s = 0.0, moved[6] = {0.0};
     for (long i = 0; i < k; i++) {
         pieces[i].until_s = until_s += pieces[i].dt_s;
@@ -705,14 +572,12 @@ static void sum_up(Piece *pieces, long k)
 
 static double time_at(const Piece *pieces, long pose) { return pose ? pieces[pose - 1].until_s : 0.0; }
 
-static double moved_at(const Piece *pieces, long pose, int axis)
-{
+static double moved_at(const Piece *pieces, long pose, int axis) {
     return pose ? pieces[pose - 1].moved[axis] : 0.0;
 }
 
 /* Noise in proportion to the mean velocity over a window around the middle of each piece. */
-static void add_scale_noise(Piece *pieces, long k, const double scales[6])
-{
+static void add_scale_noise(Piece *pieces, long k, const double scales[6]) {
     sum_up(pieces, k);
     long first = 0, last = 0;
     for (long i = 0; i < k; i++) {
@@ -732,8 +597,7 @@ static void add_scale_noise(Piece *pieces, long k, const double scales[6])
 
 /* White noise: held longer than usual, one error has moved the robot by so much more. */
 static void fill_variances(Piece *pieces, long k, const Velocities *v, const Interval *interval,
-                           const MotionFigures *figures)
-{
+                           const MotionFigures *figures) {
     double ahead_s = interval->delay_ns < 0 ? (double)-interval->delay_ns / 1e9 : 0.0;
     double usual_s[2] = {v->usual_s[0] + ahead_s, v->usual_s[1] + ahead_s};
     int some_last = 0, has_scale = 0;
@@ -759,8 +623,7 @@ static void fill_variances(Piece *pieces, long k, const Velocities *v, const Int
 }
 
 /* The estimated rows of Ad = [[R, 0], [hat(x) R, R]], (p, 6). */
-static void adjoint_rows(const Estimate *x, const Pose *pose, double Ad[36])
-{
+static void adjoint_rows(const Estimate *x, const Pose *pose, double Ad[36]) {
     double K[9], KR[9];
     hat(pose->x, K);
     times(K, pose->R, KR);
@@ -775,8 +638,7 @@ static void adjoint_rows(const Estimate *x, const Pose *pose, double Ad[36])
 /* Add Ad Q Ad' and how the calibration turns, of what belongs to one pose by the trapezoidal rule:
  * halves of the pieces before and after it, either of which may be missing. */
 static void add_at_pose(const Estimate *x, const double Ad[36], const Piece *before,
-                        const Piece *after, const Advanced *out)
-{
+                        const Piece *after, const Advanced *out) {
     int p = x->p;
     double Q[6] = {0.0};
     for (int j = 0; j < 6; j++)
@@ -808,8 +670,7 @@ static void add_at_pose(const Estimate *x, const double Ad[36], const Piece *bef
 
 /* The mean velocity about a stamp, as far as its delay may reach; 0 where a stamp is unusual. */
 static int mean_about(i64 stamp_ns, const Velocities *v, const Interval *interval, int is_planar,
-                      double mean[6])
-{
+                      double mean[6]) {
     i64 centre_ns = stamp_ns - interval->delay_ns;
     i64 start_ns = centre_ns - interval->reach_ns, end_ns = centre_ns + interval->reach_ns;
     long first = rows_up_to(v->stamps_ns, v->count, start_ns, 1) - 1;
@@ -843,8 +704,7 @@ static int mean_about(i64 stamp_ns, const Velocities *v, const Interval *interva
 
 /* Of a delay, F is what the velocity at its two ends differs by. */
 static void fill_delay(const Estimate *x, const double first[36], const double last[36],
-                       const double at_start[6], const double at_end[6], double *F)
-{
+                       const double at_start[6], const double at_end[6], double *F) {
     double before[6], after[6];
     calibrated(x, at_start, before);
     calibrated(x, at_end, after);
@@ -858,8 +718,7 @@ static void fill_delay(const Estimate *x, const double first[36], const double l
 
 /* (27)  A <- A exp(V dt) along the pieces, with noise, F and the rows of Ad at both ends. */
 static void follow_path(const Estimate *x, const Piece *pieces, long k, const Advanced *out,
-                        double first[36], double last[36])
-{
+                        double first[36], double last[36]) {
     int p = x->p;
     Pose pose = pose_of(x->A);
     memset(out->noise, 0, (size_t)(p * p) * sizeof(double));
@@ -896,8 +755,7 @@ static void follow_path(const Estimate *x, const Piece *pieces, long k, const Ad
 
 /* x <- x + J (F c + w): P + J' B + B' J with B = F P_c + (noise + F P_cc F') J / 2.
  * J, of rows like P's, is I for the pose, and turns every landmark. ``work``: 2 p N. */
-static void spread(const Estimate *x, const double *noise, const double *F, double *work)
-{
+static void spread(const Estimate *x, const double *noise, const double *F, double *work) {
     long N = x->N, room = x->room, first = x->first, c = x->c;
     int p = x->p, turns = x->turns;
     double *J = work, *B = work + p * N, *P = x->P;
@@ -942,8 +800,7 @@ static void spread(const Estimate *x, const double *noise, const double *F, doub
 
 /* Move X along velocities (27), with what that does to P. */
 static int advance(const Estimate *x, const Velocities *v, const Interval *interval,
-                   const MotionFigures *figures, const Advanced *out)
-{
+                   const MotionFigures *figures, const Advanced *out) {
     if (!is_stamp(interval->start_ns) || !is_stamp(interval->end_ns)
         || !is_stamp(interval->delay_ns) || !is_stamp(interval->reach_ns)
         || !is_stamp(v->timeout_ns) || (interval->reach_ns && !x->c_v))
@@ -1014,8 +871,7 @@ typedef struct {
 } Residuals;
 
 /* Lay the arrays of residuals out in one piece of memory, or count how many numbers they take. */
-static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory)
-{
+static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory) {
     size_t k = (size_t)x->k, n = (size_t)m, M = n * k, c = (size_t)x->c, q = (size_t)x->first;
     size_t used = 0;
     res->m = m, res->M = (long)M, res->q = x->first, res->k = x->k;
@@ -1028,20 +884,17 @@ static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory)
     return used;
 }
 
-static i64 row_of(const Landmarks *table, long n, i64 id) /* -1 for a new one */
-{
+static i64 row_of(const Landmarks *table, long n, i64 id) { /* -1 for a new one */
     long at = rows_up_to(table->sorted_ids, n, id, 0);
     return at < n && table->sorted_ids[at] == id ? table->order[at] : -1;
 }
 
-static void add_to_diagonal(double C[9], double variance)
-{
+static void add_to_diagonal(double C[9], double variance) {
     C[0] += variance, C[4] += variance, C[8] += variance;
 }
 
 /* The covariance of a point along a line of sight by its figures: along, and across. */
-static void point_covariance(const double line[3], const PointFigures *figures, double C[9])
-{
+static void point_covariance(const double line[3], const PointFigures *figures, double C[9]) {
     double square = dot3(line, line);
     double along = figures->along_0 + (figures->along_2 + figures->along_4 * square) * square;
     double across = square > 0.0 ? figures->across_0 + figures->across_2 * square : along;
@@ -1052,8 +905,7 @@ static void point_covariance(const double line[3], const PointFigures *figures, 
     add_to_diagonal(C, across + RESOLUTION_M * RESOLUTION_M + MIN_SHARE * (along + 2.0 * across));
 }
 
-static int is_zero(const double C[9])
-{
+static int is_zero(const double C[9]) {
     for (int i = 0; i < 9; i++)
         if (C[i] != 0.0)
             return 0;
@@ -1062,8 +914,7 @@ static int is_zero(const double C[9])
 
 /* That of a point y as stated, such that it can be inverted; by the figures where it is unknown. */
 static void stated_covariance(const double y[3], const double stated[9], const double line[3],
-                              const PointFigures *figures, double C[9])
-{
+                              const PointFigures *figures, double C[9]) {
     if (is_zero(stated)) {
         point_covariance(line, figures, C);
         return;
@@ -1081,8 +932,7 @@ static void stated_covariance(const double y[3], const double stated[9], const d
 
 /* y = o + d + exp(psi) e^s p of a point, where its sensor was, and its stated covariance. */
 static void corrected(const Seen *seen, long i, const double turned[9], int is_planar,
-                      double y[3], double origin[3], double stated[9])
-{
+                      double y[3], double origin[3], double stated[9]) {
     const double *arm = seen->arms + 3 * i;
     for (int b = 0; b < 3; b++)
         origin[b] = seen->origins ? seen->origins[3 * i + b] : 0.0;
@@ -1108,8 +958,7 @@ static void corrected(const Seen *seen, long i, const double turned[9], int is_p
 
 /* D = R (-hat(l) J(psi), I, l) on k axes, of a point at l from the sensor. */
 static void fill_sensitivity(const Estimate *x, const Seen *seen, const double R_hat[9],
-                             const double J[9], const double l[3], double *D)
-{
+                             const double J[9], const double l[3], double *D) {
     double K[9], of_turn[9], columns[7][3], turned[3];
     hat(l, K);
     times(K, J, of_turn);
@@ -1127,16 +976,14 @@ static void fill_sensitivity(const Estimate *x, const Seen *seen, const double R
     }
 }
 
-static double unseen_s(const Landmarks *table, i64 row, i64 stamp_ns)
-{
+static double unseen_s(const Landmarks *table, i64 row, i64 stamp_ns) {
     i64 last_ns = table->last_seen_ns[row];
     if (last_ns == stamp_ns) /* by another sensor */
         last_ns = table->seen_before_ns[row];
     return last_ns < 0 ? INFINITY : (double)(stamp_ns - last_ns) / 1e9;
 }
 
-static double repetition_factor(double dt_s, double error_time_s)
-{
+static double repetition_factor(double dt_s, double error_time_s) {
     if (error_time_s == 0.0)
         return 1.0;
     double fresh = -expm1(-larger(dt_s, MIN_INTERVAL_S) / error_time_s);
@@ -1146,8 +993,7 @@ static double repetition_factor(double dt_s, double error_time_s)
 /* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a landmark is new or in doubt. */
 static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen *seen,
                           const PointFigures *figures, const Limits *limits, const Observed *out,
-                          Residuals *res)
-{
+                          Residuals *res) {
     Pose pose = pose_of(x->A);
     double turned[9] = {0.0}, J[9] = {0.0};
     int k = x->k;
@@ -1207,8 +1053,7 @@ static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen 
 }
 
 /* [-hat(y), I] on the estimated axes, (k, p) of rows ``stride`` long. */
-static void output_matrix(const Estimate *x, const double y[3], double *C, long stride)
-{
+static void output_matrix(const Estimate *x, const double y[3], double *C, long stride) {
     double K[9];
     hat(y, K);
     for (int b = 0; b < x->k; b++) {
@@ -1219,14 +1064,12 @@ static void output_matrix(const Estimate *x, const double y[3], double *C, long 
     }
 }
 
-static long column_of(const Estimate *x, const Observed *out, long entry)
-{
+static long column_of(const Estimate *x, const Observed *out, long entry) {
     return x->first + x->k * (long)out->rows[entry / x->k] + entry % x->k;
 }
 
 static void with_noise(const Residuals *res, const double *predicted, const double *factors,
-                       const double *weights, double *S) /* + R times factors over weights */
-{
+                       const double *weights, double *S) { /* + R times factors over weights */
     int k = res->k;
     memcpy(S, predicted, (size_t)(res->M * res->M) * sizeof(double));
     for (long i = 0; i < res->m; i++) {
@@ -1239,8 +1082,7 @@ static void with_noise(const Residuals *res, const double *predicted, const doub
 
 /* predicted = C P C' of r_i = C_i (eps, c) - xi_i, with C in the middle between the landmark and
  * the point seen: turning moves at right angles to it. */
-static void fill_predicted(const Estimate *x, const Observed *out, Residuals *res)
-{
+static void fill_predicted(const Estimate *x, const Observed *out, Residuals *res) {
     long M = res->M, q = res->q;
     for (long i = 0; i < res->m; i++) {
         double middle[3], *C = res->C + res->k * i * q;
@@ -1273,8 +1115,7 @@ static void fill_predicted(const Estimate *x, const Observed *out, Residuals *re
 
 /* Whether what the others leave of residual i, ((S^-1)_ii)^-1 (S^-1 r)_i, is far off; -1 if S is
  * indefinite. ``work``: M k. */
-static int is_far_from_the_others(const Residuals *res, long i, double gate, double *work)
-{
+static int is_far_from_the_others(const Residuals *res, long i, double gate, double *work) {
     int k = res->k;
     double information[9] = {0.0}, left[3];
     for (int b = 0; b < k; b++) { /* columns of L^-1 */
@@ -1297,8 +1138,7 @@ static int is_far_from_the_others(const Residuals *res, long i, double gate, dou
 }
 
 /* S = C P C' + R, factored; 0 where a point is rejected, or may be something else. */
-static int judge(const Estimate *x, const Limits *limits, const Observed *out, Residuals *res)
-{
+static int judge(const Estimate *x, const Limits *limits, const Observed *out, Residuals *res) {
     long M = res->M;
     int k = res->k;
     double gate = limits->gate, block[9];
@@ -1331,8 +1171,7 @@ static int judge(const Estimate *x, const Limits *limits, const Observed *out, R
 
 /* g and F of motion_noise.py, from u = C' S^-1 r and G = C' S^-1 C. */
 static void score(const double *u, const double *G, const double *N, int p, double squared,
-                  double rare, double g[2], double F[4])
-{
+                  double rare, double g[2], double F[4]) {
     double NG[2][36], weight = smaller(1.0, rare / larger(squared, 1.0));
     for (int j = 0; j < 2; j++) {
         double moved = 0.0, trace = 0.0;
@@ -1360,8 +1199,7 @@ static void score(const double *u, const double *G, const double *N, int p, doub
 
 /* The logarithms and their information after an observation of g and F. */
 static void step_factors(const Factors *factors, const double g[2], const double F[4],
-                         double logs[2], double information[4])
-{
+                         double logs[2], double information[4]) {
     double right[2], change[2], kept = 1.0 - 1.0 / MEMORY;
     for (int j = 0; j < 4; j++)
         information[j] = kept * factors->information[j] + F[j];
@@ -1380,8 +1218,7 @@ static void step_factors(const Factors *factors, const double g[2], const double
 /* What these residuals say of the noise of the motion; 0 if some are to be left out of that.
  * ``work``: M (M + p + 1). */
 static int learn(const Estimate *x, const Factors *factors, double gate, const Observed *out,
-                 const Residuals *res, double *work, double logs[2], double information[4])
-{
+                 const Residuals *res, double *work, double logs[2], double information[4]) {
     long M = res->M;
     int p = x->p, k = res->k;
     double N[72], change[36] = {0.0}, block[9], u[6] = {0.0}, G[36] = {0.0}, g[2], F[4];
@@ -1438,8 +1275,7 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
 }
 
 /* Huber's weights of what the correction leaves, R S^-1 r. ``work``: M (M + 1). */
-static int fill_weights(double huber, Residuals *res, double *work)
-{
+static int fill_weights(double huber, Residuals *res, double *work) {
     long M = res->M;
     int k = res->k;
     double *L = work, *s = work + M * M;
@@ -1472,8 +1308,7 @@ static int fill_weights(double huber, Residuals *res, double *work)
 
 /* (30), (31)  dx = -K r, K = P H' S^-1, and P - K H P; 0 if S is indefinite.
  * H takes C at the landmark itself: so no observation says anything of the gauge. */
-static int correct(const Estimate *x, const Observed *out, Residuals *res, double *L)
-{
+static int correct(const Estimate *x, const Observed *out, Residuals *res, double *L) {
     long M = res->M, N = x->N, c = res->has_sensor ? x->c : 0;
     const double *P = x->P;
     for (long i = 0; i < M; i++) { /* H P */
@@ -1515,8 +1350,7 @@ static int correct(const Estimate *x, const Observed *out, Residuals *res, doubl
 }
 
 /* (28)  X <- exp(dx) X:  A <- exp(eps) A,  y_i <- exp(eps_turn) y_i + J(eps_turn) xi_i */
-static void move(const Estimate *x, const double *dx, const Observed *out)
-{
+static void move(const Estimate *x, const double *dx, const Observed *out) {
     double twist[6] = {0.0}, R_D[9], J[9], shift[3];
     memcpy(twist + x->pose, dx, (size_t)x->p * sizeof(double));
     exp_and_jacobian(twist, R_D, J);
@@ -1541,8 +1375,7 @@ static void move(const Estimate *x, const double *dx, const Observed *out)
 }
 
 /* How far off each residual was, its density given those before it, shares; then all together. */
-static void write_judged(const Residuals *res, double *judged)
-{
+static void write_judged(const Residuals *res, double *judged) {
     long m = res->m, M = res->M;
     int k = res->k;
     for (long i = 0; i < m; i++) {
@@ -1560,8 +1393,7 @@ static void write_judged(const Residuals *res, double *judged)
 /* Note that landmarks were seen, and where they should have been by the corrected state. */
 static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Observed *out,
-                   const Residuals *res)
-{
+                   const Residuals *res) {
     Pose pose = pose_of(out->A);
     for (long i = 0; i < res->m; i++) {
         i64 row = out->rows[i];
@@ -1588,8 +1420,7 @@ static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
 /* Move X by the innovation (28)-(31), and P with it. */
 static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Factors *factors,
-                   const Observed *out)
-{
+                   const Observed *out) {
     if (seen->m < 1 || seen->m > MAX_SEEN || x->first > 64 || !is_stamp(seen->stamp_ns))
         return UNUSUAL;
     Residuals res;
@@ -1622,31 +1453,33 @@ static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
     return is_usual ? DONE : UNUSUAL;
 }
 
-/* ------------------------------------------------------------------------------------ the module */
+/* ---------------------------------------------------------------------------------- the module */
 
-static PyObject *py_advance(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count)
-{
-    Door door = {.count = 0};
+static PyObject *py_advance(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count) {
+    Door door;
     Estimate x;
     Velocities velocities;
     Interval interval;
     MotionFigures figures;
     Advanced out;
     int status = UNUSUAL;
+    open_door(&door);
     if (count != 5)
         refuse("advance");
-    else if (read_estimate(&door, args[0], &x) && read_velocities(&door, args[1], &velocities)
-             && read_interval(&door, args[2], &interval)
-             && read_motion_figures(&door, args[3], &figures)
-             && read_advanced(&door, args[4], &x, &out))
+    else if (read_estimate(&door, args[0], &x)
+             && read_fields(&door, args[1], VELOCITIES, &velocities, "Velocities")
+             && read_fields(&door, args[2], INTERVAL, &interval, "Interval")
+             && read_fields(&door, args[3], MOTION_FIGURES, &figures, "MotionFigures")
+             && read_fields(&door, args[4], ADVANCED, &out, "Advanced")) {
+        velocities.count = (long)door.sizes['r'];
         status = advance(&x, &velocities, &interval, &figures, &out);
+    }
     close_door(&door);
     return PyErr_Occurred() ? NULL : PyLong_FromLong(status);
 }
 
-static PyObject *py_observe(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count)
-{
-    Door door = {.count = 0};
+static PyObject *py_observe(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count) {
+    Door door;
     Estimate x;
     Landmarks table;
     Seen seen;
@@ -1655,12 +1488,17 @@ static PyObject *py_observe(PyObject *Py_UNUSED(self), PyObject *const *args, Py
     Factors factors;
     Observed out;
     int status = UNUSUAL;
+    open_door(&door);
+    factors.are_there = count == 7 && args[5] != Py_None;
     if (count != 7)
         refuse("observe");
-    else if (read_estimate(&door, args[0], &x) && read_landmarks(&door, args[1], x.n, &table)
-             && read_seen(&door, args[2], &x, &seen) && read_point_figures(args[3], &figures)
-             && read_limits(args[4], &limits) && read_factors(&door, args[5], x.p, &factors)
-             && read_observed(&door, args[6], &x, &seen, &out))
+    else if (read_estimate(&door, args[0], &x)
+             && read_fields(&door, args[1], LANDMARKS, &table, "Landmarks")
+             && read_seen(&door, args[2], &x, &seen)
+             && read_fields(&door, args[3], POINT_FIGURES, &figures, "PointFigures")
+             && read_fields(&door, args[4], LIMITS, &limits, "Limits")
+             && (!factors.are_there || read_fields(&door, args[5], FACTORS, &factors, "Factors"))
+             && read_observed(&door, args[6], &out))
         status = observe(&x, &table, &seen, &figures, &limits, &factors, &out);
     close_door(&door);
     return PyErr_Occurred() ? NULL : PyLong_FromLong(status);
@@ -1677,7 +1515,6 @@ static struct PyModuleDef definition = {
     .m_methods = methods,
 };
 
-PyMODINIT_FUNC PyInit__core(void)
-{
+PyMODINIT_FUNC PyInit__core(void) {
     return PyModule_Create(&definition);
 }

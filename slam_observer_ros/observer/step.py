@@ -144,7 +144,8 @@ def _variances(
 ) -> FloatArray:
     """Return the variances (k, 6) of what each velocity moves the robot by."""
     # White noise: held longer than usual, one error has moved the robot by so much more.
-    usual_s = np.array(velocities.usual_s) + max(to_s(-interval.delay_ns), 0.0)
+    usual_s = np.array([velocities.usual_angular_s, velocities.usual_linear_s])
+    usual_s += max(to_s(-interval.delay_ns), 0.0)
     until_s = before_s + dt_s[:, None]
     white_s: FloatArray = dt_s[:, None]
     if np.count_nonzero(until_s > usual_s):

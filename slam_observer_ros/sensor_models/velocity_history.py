@@ -43,7 +43,8 @@ class Velocities(NamedTuple):
     body_velocities: FloatArray  # (r, 6)
     since_ns: IntArray  # (r, 2) stamps of the messages that they are of
     is_stated: BoolArray  # (r, 2) whether a message stated its covariance
-    usual_s: tuple[float, float]  # how long one is held as a rule
+    usual_angular_s: float  # how long one is held as a rule
+    usual_linear_s: float
     timeout_ns: int  # how long one is held at most
 
 
@@ -203,10 +204,10 @@ class VelocityHistory:
         count, joined = len(self._stamps_ns), self._written()
         return Velocities(
             joined.stamps_ns[:count],
-            joined.body_velocities,
-            joined.since_ns,
-            joined.is_stated,
-            self._usual_s(),
+            joined.body_velocities[:count],
+            joined.since_ns[:count],
+            joined.is_stated[:count],
+            *self._usual_s(),
             self._timeout_ns,
         )
 

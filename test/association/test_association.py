@@ -429,6 +429,25 @@ def test_where_few_pairings_are_possible_the_search_finds_the_cheapest(seed, poi
     assert costs[-1] <= costs[0] + 10.0
 
 
+@given(st.integers(0, 10_000), st.integers(1, 4), st.sampled_from([2, 3]))
+def test_where_each_point_may_be_of_one_landmark_all_pairs_are_what_the_search_finds(seed, q, k):
+    rng = np.random.default_rng(seed)
+    noise, root = np.tile(0.3 * np.eye(k), (q, 1, 1)), rng.normal(size=(q * k, q * k))
+    S = 0.2 * root @ root.T + np.kron(np.eye(q), 0.3 * np.eye(k))
+    pairs = Pairs(np.arange(q), np.arange(q), rng.normal(size=(q, k)), S, noise)
+    search = JointSearch(pairs, np.zeros(q, dtype=bool), np.full(q, huber_loss(2.5)), np.inf)
+    together, found = search.all_pairs(), search.pairings()
+    (same,) = [pairing for pairing in found if len(pairing.chosen) == q]
+    if together is None:  # one of them is better left out
+        z, log_diagonal = same.z.reshape(q, k), np.log(np.diag(same.L)).reshape(q, k)
+        rises = huber_loss(np.linalg.norm(z, axis=1)) - 2.0 * log_diagonal.sum(axis=1)
+        assert max(rises - k * np.log(0.3)) > huber_loss(2.5)
+        return
+    assert together.cost == pytest.approx(same.cost)
+    assert_allclose(together.z, same.z)
+    assert_allclose(together.L, same.L)
+
+
 @given(st.integers(0, 10_000), st.integers(0, 5), st.sampled_from([2, 3]))
 def test_what_ids_cost_does_not_depend_on_the_order_of_points(seed, m, k):
     rng = np.random.default_rng(seed)

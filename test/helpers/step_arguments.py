@@ -59,7 +59,7 @@ def random_motion(rng):
     V = rng.standard_normal((r, 6)) * (rng.random((r, 1)) < 0.9)
     is_stated = np.zeros((r, 2), dtype=np.bool_)
     usual_s = tuple(rng.choice([0.02, 0.1, np.inf], 2).tolist())
-    velocities = Velocities(stamps_ns, V, since_ns, is_stated, usual_s, SECOND_NS)
+    velocities = Velocities(stamps_ns, V, since_ns, is_stated, *usual_s, SECOND_NS)
     begin_ns = int(rng.integers(stamps_ns[1], stamps_ns[-1] + 1))
     end_ns = begin_ns + int(rng.integers(1, 500_000_000))
     delay_ns = int(rng.integers(-50_000_000, 50_000_000))

@@ -195,6 +195,33 @@ def test_ids_narrow_the_search_but_a_wrong_one_is_not_believed():
     assert place.rows[2] == -1
 
 
+@AXES
+def test_how_likely_a_place_is_beforehand_counts_what_the_look_itself_leaves_open(axes):
+    """Far from the origin a turn that is hardly known moves the frame's origin by metres."""
+    pose, exact = se3.pose(np.eye(3), np.zeros(3)), np.zeros((6, 6))
+    near = Near(pose, exact, axes)
+    open_ = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])[axes.pose, axes.pose] ** 2
+    off = se3.pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    at_pose, at_off = near.log_density(pose, open_), near.log_density(off, open_)
+    assert at_pose - at_off == pytest.approx(0.5, abs=1e-3)
+    assert near.log_density(off, 0.0 * open_) < at_off - 1e3
+    assert at_pose < near.largest
+
+
+def test_a_pose_that_is_given_decides_a_hundred_metres_from_the_origin():
+    half = np.random.default_rng(0).uniform(0, [60, 40, 0], (40, 3))
+    hall = Hall(PLANAR, points=np.concatenate([half, [60, 40, 0] - half]) + [300.0, 0, 0])
+    for _ in range(10):
+        pose = hall.anywhere()
+        points, rows = hall.see(pose, 7)
+        # The frame that is looked for has its origin far away from all that is seen there.
+        far = se3.pose(so3.exp(np.array([0.0, 0.0, 1.0])), np.array([-100.0, 50.0, 0.0]))
+        moved = seen(se3.transform(far, points.points), PLANAR)
+        prior = Near(pose @ se3.inverse(far), np.zeros((6, 6)), PLANAR)
+        place = find_places(hall.known, moved, prior, ERROR_PROBABILITY).decided(1e-3)
+        assert_array_equal(place.rows, rows)
+
+
 def test_what_would_take_too_long_is_not_decided():
     hall = Hall(PLANAR, 5, 300)
     points, _ = hall.see(hall.anywhere(), 8, false=3)

@@ -1099,6 +1099,16 @@ class TestWithoutIds:
         assert estimator.is_localised
         assert np.linalg.norm(world.error(estimator, 2.9)) < 0.2
 
+    def test_a_start_may_be_known_but_for_the_heading(self):
+        world = World(0, is_planar=True)
+        given = {'set_initial_pose': True, 'initial_position': tuple(world.start[:3, 3])}
+        deviations = {'initial_position_stddev': 0.0, 'initial_angle_stddev': 2.0}
+        estimator = Estimator(world.settings(**given, **deviations))
+        estimator.load_map(world.map())
+        add(estimator, [without_ids(event) for event in world.drive(0.0, 3.0, count=8)])
+        assert estimator.is_localised
+        assert np.linalg.norm(world.error(estimator, 2.9)) < 0.3
+
     def test_some_ids_among_others_and_a_wrong_one_do_not_hide_the_place(self):
         world = World(1, is_planar=True)
         estimator = Estimator(world.settings(localization_mode='off'))

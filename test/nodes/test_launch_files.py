@@ -91,6 +91,13 @@ def test_a_file_that_may_be_left_out_is_checked_if_it_is_named(tmp_path):
         check_optional_file(context, 'map')
 
 
+def test_maps_may_be_a_folder(tmp_path):
+    context = SimpleNamespace(launch_configurations={'map_file': str(tmp_path)})
+    check_optional_file(context, 'map_file', True)
+    with pytest.raises(RuntimeError, match=r'^map_file: no file'):
+        check_optional_file(context, 'map_file')
+
+
 def test_params_file_is_checked_before_a_node_is_started(load):
     names = load('observer.launch.py')
     (checked,) = entities(names, 'OpaqueFunction')

@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 import pytest
 
 from slam_observer_ros.nodes.demo import hall, robot
-from slam_observer_ros.nodes.demo.robot_report import Restart
+from slam_observer_ros.nodes.demo.hall_robot import Seen
+from slam_observer_ros.nodes.demo.robot_report import Interruption
 from slam_observer_ros.nodes.message_classes import TFMessage
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -18,8 +19,12 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 @pytest.mark.ros
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built')
-@pytest.mark.parametrize('options', [[], ['--keep-pose']], ids=' '.join)
-def test_the_robot_is_localised_before_and_after_a_restart(monkeypatch, capsys, options):
+@pytest.mark.parametrize(
+    'options', [[], ['--keep-pose'], ['--reflectors'], ['--reflectors', '--carried']], ids=' '.join
+)
+def test_the_robot_is_localised_before_and_after_what_happens_half_way(
+    monkeypatch, capsys, options
+):
     monkeypatch.chdir(CHECKOUT)
     exit_code = robot.main(['--duration', '14', '--real-time-factor', '1', *options])
     output = capsys.readouterr().out
@@ -55,6 +60,20 @@ def test_a_sighting_is_where_the_tag_is_within_its_noise():
             assert_allclose(in_map[:3, 3], tags[tag_id][:3, 3], atol=0.8)
 
 
+def test_a_scan_is_of_reflectors_near_the_robot_within_its_noise():
+    random = np.random.default_rng(0)
+    reflectors = hall.reflectors(random)
+    assert len(reflectors) == hall.REFLECTORS
+    for time_s in np.arange(0.0, hall.LAP_S):
+        pose = hall.true_pose(time_s)
+        points = hall.scan(pose, reflectors, random)
+        assert len(points) > 4
+        assert np.linalg.norm(points, axis=1).max() < hall.SCAN_RANGE_M + 0.2
+        in_map = points @ pose[:3, :3].T + pose[:3, 3]
+        off_m = np.linalg.norm(in_map[:, None] - reflectors, axis=2).min(axis=1)
+        assert off_m.max() < 0.3
+
+
 def test_wheels_drift_from_the_truth():
     odometry = hall.WheelOdometry(np.random.default_rng(0))
     steps = [hall.true_pose(step / 50.0) for step in range(50 * int(hall.LAP_S))]
@@ -66,12 +85,24 @@ def test_wheels_drift_from_the_truth():
 
 def test_the_time_to_be_localised_again_counts_from_the_tags():
     sight = [hall_seen(10.5, 1), hall_seen(11.0, 2), hall_seen(12.0, 2)]
-    assert Restart(10.0, ended_s=10.0, localised_s=11.4).back_after_s(sight) == pytest.approx(0.4)
-    assert Restart(10.0, ended_s=10.0, localised_s=10.2).back_after_s(sight) == 0.0
-    assert Restart(10.0, ended_s=10.0).back_after_s(sight) is None
+
+    def back_after_s(localised_s):
+        return Interruption(10.0, False, 10.0, localised_s).back_after_s(sight, 2)
+
+    assert back_after_s(11.4) == pytest.approx(0.4)
+    assert back_after_s(10.2) == 0.0
+    assert back_after_s(None) is None
+
+
+def test_a_carried_robot_is_localised_again_once_it_is_where_it_was_put():
+    carried = Interruption(10.0, is_carried=True, began_s=10.0)
+    there = np.eye(4)
+    elsewhere = there + np.eye(4, k=3) * 3.0
+    for time_s, by_tf in ((10.5, elsewhere), (11.0, None), (12.0, there), (13.0, there)):
+        assert carried.is_lost(time_s) == (time_s < 13.0)
+        carried.note(Seen(time_s, there, by_tf, 9))
+    assert carried.localised_s == 12.0
 
 
 def hall_seen(time_s, tags):
-    from slam_observer_ros.nodes.demo.hall_robot import Seen
-
     return Seen(time_s, np.eye(4), None, tags)

@@ -1,4 +1,4 @@
-"""A hall with AprilTags on its walls, and what a differential-drive robot measures in it."""
+"""A hall with AprilTags on its walls, or reflectors, and what a robot measures in it."""
 
 from __future__ import annotations
 
@@ -31,6 +31,12 @@ MAX_RANGE_M = 6.0
 MIN_FRONTAL = np.cos(np.radians(65.0))
 """Least cosine between a tag's normal and the line of sight, at which it can be read."""
 
+REFLECTORS = 500
+HALL_M = np.array([180.0, 90.0])  # one reflector in 32 m²
+LAP_SPACE_M = 20.0  # from the middle of the lap to the walls of that hall, at least
+SCAN_RANGE_M, SCAN_SHARE = 15.0, 0.7
+SCAN_NOISE_M, SCAN_NOISE_RAD = 0.02, 0.003
+
 TAG_SIZE_M = 0.16
 FOCAL_LENGTH_PX, PIXEL_NOISE_PX = 600.0, 0.5
 """By which the range r of a tag, known from its size s in the image, is off by σ r² / (f s)."""
@@ -55,6 +61,26 @@ def tag_poses() -> FloatArray:
         axes = np.column_stack([np.cross(up, normal), up, normal])
         poses.append(se3.pose(axes, np.array([x, y, z])))
     return np.array(poses)
+
+
+def reflectors(random: np.random.Generator) -> FloatArray:
+    """Return the reflectors (n, 3) of a hall somewhere in which the lap is, metres."""
+    low = random.uniform(-HALL_M + LAP_SPACE_M, -LAP_SPACE_M)
+    return np.column_stack(
+        [random.uniform(low, low + HALL_M, (REFLECTORS, 2)), np.zeros(REFLECTORS)]
+    )
+
+
+def scan(pose: FloatArray, points: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Return where a laser scanner at a pose (4, 4) sees some of points (n, 3), base frame."""
+    points = se3.transform(se3.inverse(pose), points)
+    ranges_m = np.linalg.norm(points, axis=1, keepdims=True)
+    is_seen = (ranges_m[:, 0] < SCAN_RANGE_M) & (random.random(len(points)) < SCAN_SHARE)
+    points, ranges_m = points[is_seen], ranges_m[is_seen]
+    along, across = random.standard_normal((2, len(points), 1))
+    left = points[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]  # as long as the range
+    noise = SCAN_NOISE_M / ranges_m * along * points + SCAN_NOISE_RAD * across * left
+    return np.asarray(points + noise)
 
 
 @dataclass

@@ -11,10 +11,12 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.nodes.message_classes import MESSAGES
@@ -35,7 +37,7 @@ class Seen:
     time_s: float
     truth: FloatArray
     by_tf: FloatArray | None
-    tags: int
+    landmarks: int
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class Estimated:
 class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
     """Drives about the hall, a step of ``1 / ODOMETRY_HZ`` at a time.
 
+    It sees tags, or ``reflectors`` (n, 3) where there are any.
+
     Attributes
     ----------
     seen : list of Seen
@@ -60,9 +64,11 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
 
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, reflectors: FloatArray | None) -> None:
         super().__init__('hall_robot')
         self._random = np.random.default_rng(seed)
+        self._reflectors = reflectors
+        self._carried_s = np.inf
         self._odometry = hall.WheelOdometry(self._random)
         self._truth = hall.true_pose(0.0)
         self._tag_poses = hall.tag_poses()
@@ -73,6 +79,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         self.corrections_s: list[float] = []
         self._clock_publisher = self.create_publisher(Clock, '/clock', 10)
         self._odom = self.create_publisher(Odometry, 'odom', DEEP_QOS)
+        self._cloud = self.create_publisher(PointCloud2, 'landmarks', DEEP_QOS)
         self._tf = self.create_publisher(TFMessage, '/tf', DEEP_QOS)
         static = self.create_publisher(TFMessage, '/tf_static', STATIC_QOS)
         camera = MESSAGES.transform_stamped(START_NS, 'base_link', CAMERA_FRAME, hall.CAMERA)
@@ -87,9 +94,9 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         return self._steps / ODOMETRY_HZ
 
     @property
-    def is_localised(self) -> bool:
-        """Whether map → odom is there."""
-        return self._correction is not None
+    def has_reflectors(self) -> bool:
+        """Whether it sees reflectors, and no tags."""
+        return self._reflectors is not None
 
     @property
     def is_heard(self) -> bool:
@@ -100,16 +107,30 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         """Wait for a new map → odom, as after a restart."""
         self._correction = None
 
+    def carry(self) -> None:
+        """Put the robot down on the other side of the lap, which its wheels don't notice."""
+        self._carried_s = self.time_s
+        self._truth = self._true_pose(self.time_s)
+
+    def _true_pose(self, time_s: float) -> FloatArray:
+        return hall.true_pose(time_s + (0.5 * hall.LAP_S if time_s >= self._carried_s else 0.0))
+
     def step(self) -> None:
         """Move on, and publish what is measured."""
         self._steps += 1
-        before, self._truth = self._truth, hall.true_pose(self.time_s)
+        before, self._truth = self._truth, self._true_pose(self.time_s)
         self._odometry.advance(before, self._truth, 1.0 / ODOMETRY_HZ)
         stamp_ns = START_NS + to_ns(self.time_s)
         self._clock_publisher.publish(Clock(clock=MESSAGES.time(stamp_ns)))
         self._publish_odometry(stamp_ns)
         if self._steps % ODOMETRY_PER_IMAGE == 0:
-            self._publish_tags(stamp_ns)
+            count = (
+                self._publish_tags(stamp_ns)
+                if self._reflectors is None
+                else self._publish_scan(stamp_ns, self._reflectors)
+            )
+            by_tf = None if self._correction is None else self._correction @ self._odometry.pose
+            self.seen.append(Seen(self.time_s, self._truth, by_tf, count))
 
     def _publish_odometry(self, stamp_ns: int) -> None:
         odometry = self._odometry
@@ -121,7 +142,13 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         transform = MESSAGES.transform_stamped(stamp_ns, 'odom', 'base_link', odometry.pose)
         self._tf.publish(TFMessage(transforms=[transform]))
 
-    def _publish_tags(self, stamp_ns: int) -> None:
+    def _publish_scan(self, stamp_ns: int, reflectors: FloatArray) -> int:
+        points = hall.scan(self._truth, reflectors, self._random)
+        ids = np.full(len(points), UNKNOWN_ID)
+        self._cloud.publish(MESSAGES.point_cloud2(stamp_ns, 'base_link', ids, points))
+        return len(points)
+
+    def _publish_tags(self, stamp_ns: int) -> int:
         tags = hall.sightings(self._truth, self._tag_poses, self._random)
         transforms = [
             MESSAGES.transform_stamped(stamp_ns, CAMERA_FRAME, f'tag36h11:{tag_id}', pose)
@@ -129,8 +156,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         ]
         if transforms:
             self._tf.publish(TFMessage(transforms=transforms))
-        by_tf = None if self._correction is None else self._correction @ self._odometry.pose
-        self.seen.append(Seen(self.time_s, self._truth, by_tf, len(tags)))
+        return len(tags)
 
     def _hear_transforms(self, message: TFMessage) -> None:
         for each in message.transforms:
@@ -147,7 +173,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         self.estimated.append(
             Estimated(
                 time_s,
-                hall.true_pose(time_s),
+                self._true_pose(time_s),
                 _matrix(pose.position, pose.orientation),
                 covariance,
             )

@@ -1,7 +1,8 @@
-"""``make robot``: a simulated robot with a camera is localised among tags, as for Nav2.
+"""``make robot``: a simulated robot is localised among tags, or reflectors, as for Nav2.
 
 It drives about a hall with AprilTags on its walls: lost at first, its localisation restarted in
-the middle. Over DDS, the observer is started as ``localization.launch.py`` does it.
+the middle, or the robot itself carried elsewhere. Over DDS, the observer is started as
+``localization.launch.py`` does it.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ from rich.console import Console
 from rich.progress import Progress
 
 from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.nodes.demo.hall_robot import HallRobot, ODOMETRY_HZ
-from slam_observer_ros.nodes.demo.robot_report import report, Restart
+from slam_observer_ros.nodes.demo.robot_report import Interruption, report
 from slam_observer_ros.nodes.launch_setup import command_line, EXECUTABLE
 from slam_observer_ros.nodes.stop_signal import StopSignal
 from slam_observer_ros.settings.estimator_settings import Settings
 
-PARAMS_FILE = 'config/tags_on_tf.yaml'
+PARAMS_FILE, PARAMS_OF_REFLECTORS = 'config/tags_on_tf.yaml', 'config/reflectors.yaml'
 LAUNCH_ARGUMENTS = {'map_file': 'hall.yaml', 'twist': 'odom', 'use_sim_time': 'true'}
 """Arguments of the launch file, beside ``params_file``."""
 
@@ -55,16 +57,18 @@ class RobotError(SlamObserverError):
 class Observer:
     """The process of the observer, which can be ended and started again."""
 
-    def __init__(self, folder: Path, real_time_factor: float, keeps_pose: bool) -> None:
+    def __init__(self, folder: Path, options: argparse.Namespace) -> None:
         self._log = folder / f'{EXECUTABLE}.log'
+        self._input = "PointCloud2 on '/landmarks'" if options.reflectors else "TFMessage on '/tf'"
+        params_file = PARAMS_OF_REFLECTORS if options.reflectors else PARAMS_FILE
         arguments = LAUNCH_ARGUMENTS | {'map_file': str(folder / LAUNCH_ARGUMENTS['map_file'])}
         # The rate is one of wall time, in which the simulation is faster.
-        more = ['-p', f'publish_rate:={RATE_HZ * real_time_factor}']
-        if keeps_pose:
+        more = ['-p', f'publish_rate:={RATE_HZ * options.real_time_factor}']
+        if options.keep_pose:
             more += ['-p', f'pose_file:={folder / "pose.yaml"}']
         self._command = [
             *(sys.executable, '-m', 'slam_observer_ros.nodes.executables', EXECUTABLE),
-            *command_line(PARAMS_FILE, arguments),
+            *command_line(params_file, arguments),
             *more,
         ]
         self._process: subprocess.Popen[bytes] | None = None
@@ -78,11 +82,11 @@ class Observer:
 
     @property
     def hears_robot(self) -> bool:
-        """Whether it has subscribed to odometry and tags; RobotError if it has ended."""
+        """Whether it has subscribed to odometry and landmarks; RobotError if it has ended."""
         if self._process is None or self._process.poll() is not None:
             raise RobotError(f'the observer has ended; see {self._log}')
         text = self._log.read_text(encoding='utf-8', errors='replace')
-        return "Odometry on '/odom'" in text and "TFMessage on '/tf'" in text
+        return "Odometry on '/odom'" in text and self._input in text
 
     def end(self) -> None:
         """End it, whatever it does."""
@@ -103,8 +107,8 @@ def main(args: Sequence[str] | None = None) -> int:
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
         with tempfile.TemporaryDirectory(prefix='slam_observer_robot_') as name:
-            robot, restart = _run(options, Path(name), console)
-        return 0 if report(robot, restart, RATE_HZ, console) else 1
+            robot, interruption = _run(options, Path(name), console)
+        return 0 if report(robot, interruption, RATE_HZ, console) else 1
     except SlamObserverError as error:
         console.print(f'robot: {error}', style='red', markup=False)
         return 1
@@ -124,26 +128,42 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--keep-pose', action='store_true', help='let the observer keep its pose over the restart'
     )
+    parser.add_argument(
+        '--reflectors',
+        action='store_true',
+        help=f'see reflectors without ids, {hall.REFLECTORS} in a large hall, in place of tags',
+    )
+    parser.add_argument(
+        '--carried',
+        action='store_true',
+        help='carry the robot to another place half-way, in place of the restart',
+    )
     parser.add_argument('--seed', type=int, default=0, help='of what is random (default 0)')
     return parser
 
 
-def _run(options: argparse.Namespace, folder: Path, console: Console) -> tuple[HallRobot, Restart]:
-    """Drive, restarting the observer half-way."""
+def _run(
+    options: argparse.Namespace, folder: Path, console: Console
+) -> tuple[HallRobot, Interruption]:
+    """Drive, restarting the observer half-way, or carrying the robot."""
     stop = StopSignal()
     stop.begin()
-    write_map(folder / LAUNCH_ARGUMENTS['map_file'], _surveyed(options.seed), Settings())
+    reflectors = None
+    if options.reflectors:
+        reflectors = hall.reflectors(np.random.default_rng(options.seed))
+    points = hall.tag_poses()[:, :3, 3] if reflectors is None else reflectors
+    write_map(folder / LAUNCH_ARGUMENTS['map_file'], _surveyed(points, options.seed), Settings())
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with ExitStack() as cleanup:
         cleanup.callback(rclpy.try_shutdown)
-        robot = HallRobot(options.seed)
+        robot = HallRobot(options.seed, reflectors)
         cleanup.callback(robot.destroy_node)
         cleanup.enter_context(_listening(robot))
-        observer = Observer(folder, options.real_time_factor, options.keep_pose)
+        observer = Observer(folder, options)
         cleanup.callback(observer.end)
         observer.start()
         _wait_until_heard(robot, observer)
-        restart = Restart(options.duration / 2.0)
+        interruption = Interruption(options.duration / 2.0, options.carried)
         progress = cleanup.enter_context(Progress(console=console, transient=True))
         task = progress.add_task('driving', total=options.duration)
         due_s = time.monotonic()
@@ -154,18 +174,21 @@ def _run(options: argparse.Namespace, folder: Path, console: Console) -> tuple[H
             progress.update(task, completed=robot.time_s)
             due_s += 1.0 / (ODOMETRY_HZ * options.real_time_factor)
             time.sleep(max(0.0, due_s - time.monotonic()))
-            if restart.ended_s is None and robot.time_s >= restart.planned_s:
-                _restart(robot, observer, restart)
+            if interruption.began_s is None and robot.time_s >= interruption.planned_s:
+                interruption.began_s = robot.time_s
+                if options.carried:
+                    robot.carry()
+                else:
+                    _restart(robot, observer)
                 due_s = time.monotonic()
-            if restart.localised_s is None and restart.ended_s and robot.is_localised:
-                restart.localised_s = robot.time_s
+            if robot.seen:
+                interruption.note(robot.seen[-1])
         time.sleep(END_S)
-    return robot, restart
+    return robot, interruption
 
 
-def _surveyed(seed: int) -> LandmarkMap:
-    """Return the tags as somebody has measured them with a tape."""
-    points = hall.tag_poses()[:, :3, 3]
+def _surveyed(points: FloatArray, seed: int) -> LandmarkMap:
+    """Return landmarks (n, 3) as somebody has measured them with a tape."""
     off = np.random.default_rng(seed + 1).normal(0.0, SURVEY_SIGMA_M, points.shape)
     count = len(points)
     covariances = np.tile(SURVEY_SIGMA_M**2 * np.eye(3), (count, 1, 1))
@@ -195,9 +218,8 @@ def _listening(robot: HallRobot) -> Iterator[None]:
         thread.join(STOP_LIMIT_S)
 
 
-def _restart(robot: HallRobot, observer: Observer, restart: Restart) -> None:
+def _restart(robot: HallRobot, observer: Observer) -> None:
     """End the observer and start it again; the robot's time stands still meanwhile."""
-    restart.ended_s = robot.time_s
     observer.end()
     time.sleep(DISCOVERY_S)
     robot.forget_correction()
