@@ -143,7 +143,7 @@ class RiccatiFilter(OrientationGains):
 
     def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:
         # C as the prediction has it: in the middle between where landmarks are expected and seen.
-        C = self.axes.output_matrix(residuals.e - 0.5 * residuals.r + residuals.a)
+        C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
         self.motion_noise.factors.learn(r, S, C)
 
     def distances(self, residuals: Residuals) -> FloatArray:
@@ -218,7 +218,7 @@ class RiccatiFilter(OrientationGains):
         self.joint = joint = self.joint.dense()
         k = self.axes.point
         G = joint.chart.gauge(len(self.observer))
-        J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
+        J = joint.chart.moved(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
         HP, HPH = joint.project(joint.chart.still(self.observer.points[rows]), rows)  # of −ã_i
         R = block_diagonal(covariances[:, :k, :k])
