@@ -18,10 +18,12 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'demo'))
+import hall
 
 PARAMS_FILE = Path(__file__).resolve().parents[1] / 'config' / 'tags_on_tf.yaml'
 EVERY = (4, 2, 1)
