@@ -32,7 +32,8 @@ class Change:
     slots: IntArray  # (m,) landmarks that are not in x any more, ascending
     points: FloatArray  # (m, 3) their references
     rows: IntArray  # (m k,) and rows
-    outputs: FloatArray  # (q, m k): their covariance with others is that of x times this
+    columns: IntArray  # (m k,) and entries of x
+    turning: FloatArray  # (m k, p) T of η = ξ − T ε
     own: FloatArray  # (m k, m k) their own
     to_x: FloatArray  # (m k, …) and with the entries that stay
 
@@ -246,7 +247,7 @@ class OutsideLandmarks:
         Z = X[:, :s] + 0.5 * D @ change.turns[:, :s]
         U = np.hstack([before @ change.root, D + Z, D - Z])
         X += D @ change.turns
-        V = X @ change.outputs
+        V = X[:, change.columns] - X[:, : change.turning.shape[1]] @ change.turning.T
         X = X[:, change.kept]
         blocks = U.reshape(len(points), self._stride, U.shape[1])
         own = panel.own + (blocks * change.weights) @ transpose(blocks)
