@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 import sys
 
@@ -23,7 +24,7 @@ from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / 'demo'))
-import hall
+hall = import_module('hall')
 
 PARAMS_FILE = Path(__file__).resolve().parents[1] / 'config' / 'tags_on_tf.yaml'
 EVERY = (4, 2, 1)

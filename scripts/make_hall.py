@@ -8,6 +8,7 @@ carried elsewhere, which its wheels do not notice.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 import sys
 
@@ -35,7 +36,7 @@ from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / 'demo'))
-import hall
+hall = import_module('hall')
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 IMAGE = CHECKOUT / 'docs' / 'images' / 'reflectors.png'
