@@ -118,7 +118,14 @@ def test_the_example_of_contributing_is_all_that_a_landmark_type_takes(beacons, 
     assert beacons.__doc__
 
 
-def test_parameters_offer_a_type_and_an_unread_one_is_said_to_be_none(beacons, tmp_path):
+def test_parameters_and_help_offer_a_type_and_an_unread_one_is_said_to_be_none(
+    beacons, tmp_path, capsys
+):
+    helped = CommandLine(capsys)('replay', '--help').output
+    assert (
+        'BeaconArray'
+        in helped.rpartition('--landmarks-topic TOPIC')[2].partition('--imu TOPIC')[0]
+    )
     assert 'BeaconArray' in choices(InputSettings, 'landmarks_type')
     assert 'BeaconArray' in choices(ObserverNodeSettings, 'landmarks_type')
     del message_types._REGISTERED['landmarks', BEACONS]
