@@ -371,7 +371,8 @@ def are_one(
             rows, other_rows = state.landmarks.rows_of(ids), other.landmarks.rows_of(ids)
             if (rows < 0).any() or (other_rows < 0).any():
                 return False
-            shifts.append(state.world_points[rows] - other.world_points[other_rows])
+            own, others = state.filter.world_points, other.filter.world_points
+            shifts.append(own[rows] - others[other_rows])
     distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
     return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)
 

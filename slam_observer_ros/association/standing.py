@@ -8,6 +8,7 @@ carries them along: these are not places.
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass, field, replace
 import math
 from typing import TypeAlias
@@ -58,6 +59,12 @@ LEAST = 2
 MOST = 0.75
 """Share of the landmarks in view that stands for all of them: some points are false."""
 
+TOGETHER_NS = to_ns(0.25)
+"""Observations of few landmarks each, or of several sensors, are one look for so long.
+
+At the start for half of that.
+"""
+
 UNSEEN_NS = to_ns(1.0)
 """For how long a slip goes on unseen."""
 
@@ -91,9 +98,12 @@ class _Pairs:
     since_ns: int
 
     @classmethod
-    def of(cls, start: _Look, now: _Look, moved: list[Move]) -> _Pairs:
-        """Return those of two looks, between which the robot has ``moved`` by odometry."""
-        first = {i: row for row, i in enumerate(start.event.ids.tolist()) if i != UNKNOWN_ID}
+    def of(cls, start: _Look, now: _Look, moved: list[Move], but: Set[int]) -> _Pairs:
+        """Return those of two looks, ``but`` some.
+
+        In between the robot has ``moved`` by odometry.
+        """
+        first = {i: row for row, i in enumerate(start.event.ids.tolist()) if i not in but}
         both = [(row, i) for row, i in enumerate(now.event.ids.tolist()) if i in first]
         rows, ids = [row for row, _ in both], [i for _, i in both]
         before = start.event.points[[first[i] for i in ids]]
@@ -204,21 +214,22 @@ class Standing:
     sensor_frame: str = ''  # an observation is due from another one, …
     due_ns: int = 0  # … or from here on
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
-    _starts: dict[str, _Look] = field(default_factory=dict)  # what is compared with, by sensor
-    _latest: dict[str, _Look] = field(default_factory=dict)
-    _tested: dict[str, _Look] = field(default_factory=dict)  # the latest when that was judged
+    _starts: list[_Look] = field(default_factory=list)  # what is compared with, …
+    _latest: list[_Look] = field(default_factory=list)  # … and what is
+    _tested: list[_Look] = field(default_factory=list)  # the latest when that was judged
     _test_ns: int = 0
     _wait_ns: int = TEST_NS  # until so much has passed that it is clear
     _odd: set[int] = field(default_factory=set)  # what did not pass as it should have
     _usual_m2: float = 0.0  # mean square of the ways from which on it is clear what passes, …
     _enough_m2: float = 0.0  # … or with which it is judged again
-    _confirmed_ns: int = 0  # when it was seen last that a slip goes on
+    # During a slip, when each landmark was seen last, and whether as that has it.
+    _agreed: dict[int, tuple[int, bool]] = field(default_factory=dict)
     _earlier: list[Move] = field(default_factory=list)  # … and that before
 
     def clear_time(self) -> None:
         """Compare nothing with what was seen before."""
         self.slip, self.due_ns = None, 0
-        self._starts, self._latest, self._tested = {}, {}, {}
+        self._starts, self._latest, self._tested = [], [], []
         self.moved, self._earlier = [], []
 
     def note(
@@ -233,62 +244,78 @@ class Standing:
         look, lost = _Look(event, len(self.moved)), None
         if self.slip is not None:
             lost = self._go_on(state, look)
-        elif event.sensor_frame in self._starts:
-            self._latest[event.sensor_frame] = look
+        elif not self._starts:
+            self._begin(look)
+        elif self._belongs_to_start(event):
+            self._starts.append(look)
+        else:
+            since_ns = event.stamp_ns - TOGETHER_NS
+            self._latest = [one for one in self._latest if one.event.stamp_ns > since_ns]
+            self._latest.append(look)
             if event.stamp_ns >= self._test_ns:
                 lost = self._test(state, look, velocities)
-        elif self._starts:
-            self._starts[event.sensor_frame] = look
-        else:
-            self._begin(event)
-        some_wait = self.slip is not None or len(self._starts) > 1
-        self.due_ns = 0 if some_wait else self._test_ns
+        # Each where there are several sensors, or few landmarks in one.
+        is_whole = len(self._starts) == 1 and len(self._starts[0].event.ids) >= LEAST
+        self.due_ns = self._test_ns if is_whole and self.slip is None else 0
         return lost
 
-    def _begin(self, event: ObservationEvent) -> None:
+    def _belongs_to_start(self, event: ObservationEvent) -> bool:
+        """Return whether an observation is one of those that are compared with later ones."""
+        if all(event.sensor_frame != start.event.sensor_frame for start in self._starts):
+            return True
+        if len(self._starts[0].event.ids) >= LEAST:
+            return False
+        return event.stamp_ns - self._starts[0].event.stamp_ns < TOGETHER_NS // 2
+
+    def _begin(self, look: _Look) -> None:
         """Compare with this observation from now on."""
+        event = look.event
         self.sensor_frame = event.sensor_frame
-        self._starts, self._latest = {event.sensor_frame: _Look(event, 0)}, {}
+        self._starts, self._latest = [_Look(event, 0)], []
         self._earlier, self.moved = self.moved, []
-        self._tested, self._enough_m2 = {}, self._usual_m2
-        self._test_ns = event.stamp_ns + self._wait_ns
+        self._tested, self._enough_m2 = [], self._usual_m2
+        more_ns = 0 if len(event.ids) >= LEAST else TOGETHER_NS // 2
+        self._test_ns = event.stamp_ns + self._wait_ns + more_ns
 
     def _test(self, state: State, look: _Look, velocities: VelocityHistory) -> Lost | None:
         """Look for a slip, and for landmarks that are carried along."""
-        event, seen = look.event, self._pairs()
-        ids = [i for pairs in seen for i in pairs.ids]
-        if len(ids) < LEAST:
-            self._begin(event)
+        event = look.event
+        age_ns = event.stamp_ns - self._starts[0].event.stamp_ns
+        if len(_ids(self._latest) & _ids(self._starts)) < LEAST:
+            if len(event.ids) >= LEAST or age_ns > UNSEEN_NS:  # else more may follow
+                self._begin(look)
             return None
-        tested, self._tested = self._tested, dict(self._latest)
-        way_m2 = sum(pairs.squared_way for pairs in seen) / len(ids)
-        age_ns = event.stamp_ns - self._starts[event.sensor_frame].event.stamp_ns
+        seen = self._pairs()
+        ids = [i for pairs in seen for i in pairs.ids]
+        tested, self._tested = self._tested, list(self._latest)
+        way_m2 = sum(pairs.squared_way for pairs in seen) / max(len(ids), 1)
         needed = math.sqrt(self._usual_m2 / way_m2) if way_m2 else math.inf
         self._wait_ns = int(min(max(needed * age_ns, TEST_NS), LONGEST_WAIT_NS))
         self._test_ns = event.stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
         if way_m2 <= self._enough_m2:
             if age_ns > LAST_TEST_NS:
-                self._begin(event)
+                self._begin(look)
             return None
         is_usual = self._is_usual(ids, {i for pairs in seen for i in pairs.lagging})
         if is_usual or state.landmark_velocity_stddev:
             self._usual_m2 *= FORGOTTEN
-            self._begin(event)
+            self._begin(look)
             return None
         view = _View.of(state, seen, velocities)
         self._usual_m2 = way_m2 * USUAL**2 / np.mean(view.way**2)
         self._enough_m2 = 2.0 * way_m2
         if self._slips(state, view):
-            self._confirmed_ns, self._starts = event.stamp_ns, self._latest
+            self._agreed = dict.fromkeys(ids, (event.stamp_ns, True))
+            self._starts = self._latest
             lost = self._lost(self.moved[-1:], self._earlier + self.moved)
             self.moved = []
             return lost
         if view.passes.any():
             self._sort(view)
-            self._begin(event)
+            self._begin(look)
         elif view.is_mixed and tested:
             # A slip has begun meanwhile, or ended.
-            self._starts, self._tested, self._enough_m2 = tested, {}, 0.0
+            self._starts, self._tested, self._enough_m2 = tested, [], 0.0
             return self._test(state, look, velocities)
         return None
 
@@ -299,10 +326,16 @@ class Standing:
         return 2 * len(odd) < len(ids) and odd.isdisjoint(before)
 
     def _pairs(self) -> list[_Pairs]:
-        """Return what each sensor has seen at the start and lately, where it has."""
-        looks = [(self._starts[name], now) for name, now in self._latest.items()]
-        seen = [_Pairs.of(a, b, self.moved[a.moves : b.moves]) for a, b in looks]
-        return [pairs for pairs in seen if pairs.ids]
+        """Return what was seen at the start and lately, each landmark once by each sensor."""
+        seen, known = [], dict[str, set[int]]()
+        for now in reversed(self._latest):
+            but = known.setdefault(now.event.sensor_frame, {UNKNOWN_ID})
+            for start in self._starts:
+                if start.event.sensor_frame == now.event.sensor_frame:
+                    pairs = _Pairs.of(start, now, self.moved[start.moves : now.moves], but)
+                    but.update(pairs.ids)
+                    seen += [pairs] if pairs.ids else []
+        return seen
 
     def _slips(self, state: State, view: _View) -> bool:
         """Find out whether one of the SLIPS has begun."""
@@ -317,29 +350,36 @@ class Standing:
         """Return what :meth:`note` does during a slip, or None once it is over."""
         event, made = look.event, self.moved
         self._slip_on(made)
-        start = self._starts.setdefault(event.sensor_frame, _Look(event, 0))
-        pairs, agree = _Pairs.of(start, look, []), np.empty(0, dtype=np.bool_)
-        if pairs.ids:
+        self._latest, look = [_Look(event, 0)], _Look(event, 0)
+        new = set(event.ids.tolist())
+        for pairs in self._pairs():
             shift = (pairs.points - pairs.before)[:, : state.axes.point]
             agree = mahalanobis(shift, _noise(state, [pairs])) <= NOISE
-            agree = agree[self._are_places(state, pairs.ids)]
-        if start.event is not event and np.count_nonzero(agree) >= LEAST:
-            self._confirmed_ns = event.stamp_ns
-            if self.slip and event.stamp_ns - start.event.stamp_ns > UNSEEN_NS:
-                self._starts = {event.sensor_frame: _Look(event, 0)}  # whose turn is exact
-        is_unseen = event.stamp_ns - self._confirmed_ns > UNSEEN_NS
-        if 2 * np.count_nonzero(agree) < len(agree) or is_unseen:
+            are_places = self._are_places(state, pairs.ids)
+            for i, agrees, is_place in zip(pairs.ids, agree, are_places, strict=True):
+                new.discard(i)
+                if is_place:
+                    self._agreed[i] = event.stamp_ns, bool(agrees)
+        since_ns = event.stamp_ns - UNSEEN_NS
+        self._agreed = {i: last for i, last in self._agreed.items() if last[0] > since_ns}
+        count = sum(agrees for _, agrees in self._agreed.values())
+        if count < LEAST or 2 * count < len(self._agreed):
             self.slip = None
-            self._begin(event)
+            self._begin(look)
             return None
+        if self.slip and self._starts[0].event.stamp_ns < since_ns:
+            self._starts = [look]  # whose turn is exact
+        elif new:
+            self._starts.append(look)
         return self._lost(made, made)
 
     def _slip_on(self, made: list[Move]) -> None:
         """Move what is compared with by what a slip makes of motions; forget these."""
         back = se3.exp(-SLIPS[self.slip or 0] * se3.log(_product(made)))
-        for name, start in self._starts.items():
-            points = se3.transform(back, start.event.points)
-            self._starts[name] = _Look(replace(start.event, points=points), 0)
+        self._starts = [
+            _Look(replace(one.event, points=se3.transform(back, one.event.points)), 0)
+            for one in self._starts
+        ]
         self.moved = []
 
     def _lost(self, made: list[Move], whole: list[Move]) -> Lost:
@@ -365,6 +405,10 @@ class Standing:
         evidence = self._evidence = {i: much for i, much in self._evidence.items() if much}
         self.carried = {i for i, much in evidence.items() if much == CERTAIN or i in self.carried}
         self.excluded = self.carried | {i for i, much in evidence.items() if much >= CLEAR**2}
+
+
+def _ids(looks: list[_Look]) -> set[int]:
+    return {i for look in looks for i in look.event.ids.tolist() if i != UNKNOWN_ID}
 
 
 def _noise(state: State, seen: list[_Pairs]) -> FloatArray:

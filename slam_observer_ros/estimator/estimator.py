@@ -438,7 +438,8 @@ class Estimator:
     @property
     def world_points(self) -> FloatArray:
         """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
-        points, lead_s = self._state.world_points[self._state.confirmed], self._timeline.lead_s
+        state, lead_s = self._state, self._timeline.lead_s
+        points = state.filter.world_points[state.confirmed]
         return points + lead_s * self.landmark_velocities if lead_s else points
 
     @property

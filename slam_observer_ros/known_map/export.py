@@ -29,7 +29,7 @@ def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
         return _exact_map(state, rows, loaded)
     landmark_map = LandmarkMap(
         state.landmarks.ids[rows],
-        state.world_points[rows],
+        state.filter.world_points[rows],
         None,
         state.landmarks.counts[rows],
         orientations=_orientations_of(state, rows),

@@ -120,6 +120,10 @@ class Chart:
         G[self.turns(rows)] = np.tile(self._turned, (n, 1))
         return G
 
+    def moved(self, points: FloatArray) -> FloatArray:
+        """Return J_i = [−[y_i]×, I] (m, k, p): how exp(γ) moves points y_i (m, 3)."""
+        return self.axes.output_matrix(points)
+
     def at_rest(self, n: int, rows: IntArray, points: FloatArray) -> FloatArray:
         """Return G (N, p) likewise if landmarks ``rows`` at ``points`` (m, 3) are not moved."""
         G = np.zeros((self.first + n * self.stride, self.axes.p))

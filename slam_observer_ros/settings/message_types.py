@@ -69,9 +69,11 @@ def message_types(role: Role) -> dict[str, MessageType]:
     return {known.name: known for known in ordered if known.role == role}
 
 
-def short_names(role: Role) -> tuple[str, ...]:
-    """Return the names of the same types as parameters have them."""
-    return tuple(dict.fromkeys(known.short_name for known in message_types(role).values()))
+def short_names(role: Role, is_ambiguous: bool | None = None) -> tuple[str, ...]:
+    """Return the names of the same types as parameters have them, or only of some."""
+    types = message_types(role).values()
+    some = [known for known in types if is_ambiguous in (None, known.is_ambiguous)]
+    return tuple(dict.fromkeys(known.short_name for known in some))
 
 
 @cache

@@ -76,11 +76,6 @@ class State:
         often = self.landmarks.counts >= self.settings.confirmations
         return np.flatnonzero(often & ~self.landmarks.tentative)
 
-    @property
-    def world_points(self) -> FloatArray:
-        """(n, 3) estimated landmarks, metres, world."""
-        return self.filter.world_points
-
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:
         """Return those (n, 3, 3) of landmarks after ``duration_s``, world, m²; or None."""
         return covariances.of_landmarks(

@@ -206,6 +206,33 @@ def test_what_the_robot_carries_is_no_place(name, from_s, caplog):
     assert 'Landmarks 100, 101, 102 move with the robot' in caplog.text
 
 
+def by_two_cameras(event):
+    """Yield what each of two cameras sees of it."""
+    for frame, is_its in (('left', event.points[:, 1] > 0), ('right', event.points[:, 1] <= 0)):
+        yield replace(event.select(is_its), sensor_frame=frame)
+
+
+def one_by_one(event):
+    """Yield it with one landmark a message."""
+    for row in range(len(event.ids)):
+        yield event.select(np.arange(len(event.ids)) == row)
+
+
+@pytest.mark.parametrize('parts', [by_two_cameras, one_by_one])
+@pytest.mark.parametrize('name', ['ring', 'space'])
+def test_what_is_seen_in_parts_is_one_look(name, parts):
+    world = WORLDS[name]
+    whole, truth = world.drive(16.0, stands_s=[(9.0, 13.0)], cargo=RACK)
+    events = []
+    for event in whole:
+        events += parts(event) if isinstance(event, ObservationEvent) else [event]
+    estimator, off_m = world.run((events, truth))
+    assert estimator.counts['slip'] <= 2
+    assert estimator.counts['carried_landmark'] == len(RACK)
+    assert max(estimator.landmark_ids) < 100
+    assert off_m[-1] < 0.15
+
+
 def test_what_it_has_put_down_is_a_place_again():
     estimator, off_m = RING.run(RING.drive(20.0, cargo=RACK, cargo_s=(0.0, 8.0)))
     assert estimator.counts['carried_landmark'] == len(RACK)

@@ -109,7 +109,7 @@ def test_a_depth_is_recognised_and_scales_that_trade_are_named(slam_observer, tm
         return replace(event, ids=event.ids[ahead], points=(event.points * along)[ahead])
 
     recording, _ = recorded(tmp_path / 'run.mcap', world.with_observations(shown))
-    found = slam_observer('calibrate', recording, *OPTIONS, '--json').json
+    found = slam_observer('calibrate', recording, *OPTIONS, '--keep-noise', '--json').json
     assert found['range_is_depth']
     assert found['depth_gain'][0] > 5.0 * found['depth_gain'][1]
     assert found['parameters']['range_is_depth']
@@ -122,7 +122,8 @@ def test_a_depth_is_recognised_and_scales_that_trade_are_named(slam_observer, tm
 def test_where_all_is_as_stated_nothing_is_written(slam_observer, tmp_path):
     recording, survey = recorded(tmp_path / 'run.mcap', drive(Settings(**MODEL), 20.0))
     out = tmp_path / 'calibrated.yaml'
-    ended = slam_observer('calibrate', recording, '--map', survey, *OPTIONS, '-o', out)
+    options = ('--map', survey, *OPTIONS, '--keep-noise', '-o', out)
+    ended = slam_observer('calibrate', recording, *options)
     assert ended.code == 4
     assert 'no improvement' in ended.errors
     assert 'held out' in ended.output
@@ -169,6 +170,11 @@ def test_velocities_are_as_noisy_as_they_are():
     assert wide.range_scale_stddev == settings.range_scale_stddev
     assert wide.linear_scale_stddev[0] > 0.0
     assert wide.linear_scale_stddev[1] == 0.0
+    # Without a map the ranges' scale is found where the wheels are known, and only there.
+    assert opened(settings, {}, motion, is_surveyed=False).range_scale_stddev == 0.0
+    known = opened(settings, {'linear_scale_stddev'}, motion, is_surveyed=False)
+    assert known.range_scale_stddev > 0.0
+    assert known.linear_scale_stddev == settings.linear_scale_stddev
 
 
 def test_only_what_is_little_known_trades():

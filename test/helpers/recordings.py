@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import math
 from pathlib import Path
 
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 import numpy as np
 import ros_messages as ros
 from rosbags import rosbag1, rosbag2
@@ -51,6 +54,28 @@ def write_mcap(path: Path) -> Path:
         writer.write_landmarks(ros.STAMP_NS, LANDMARKS)
         for item in (*events(), *true_poses()):
             writer.write_event(item)
+    return path
+
+
+def write_beginning(path: Path, of: Path, seconds: float) -> Path:
+    """Write the first seconds of an MCAP file as another one."""
+    with of.open('rb') as opened, path.open('wb') as file:
+        reader, writer, channels = make_reader(opened), McapWriter(file), dict[int, int]()
+        writer.start(profile='ros2')
+        until_ns = math.inf
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            until_ns = min(until_ns, message.log_time + seconds * 1e9)
+            if message.log_time > until_ns:
+                break
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time
+            )
+        writer.finish()
     return path
 
 

@@ -8,18 +8,19 @@ import re
 
 from command_line import CommandLine
 import pytest
+from recordings import write_beginning
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 
 
 @pytest.fixture(name='advice')
 def fixture_advice(capsys, tmp_path):
-    def advice(**settings):
+    def advice(recording=SAMPLE, **settings):
         report = tmp_path / 'run.html'
         options = [
             word for name, value in settings.items() for word in ('--set', f'{name}={value}')
         ]
-        ended = CommandLine(capsys)('replay', SAMPLE, '--report', report, *options)
+        ended = CommandLine(capsys)('replay', recording, '--report', report, *options)
         assert ended.code == 0
         found = re.search(r'id="numbers">(.*?)</script>', report.read_text(), re.S)
         findings = json.loads(found.group(1))['findings']
@@ -40,7 +41,8 @@ def test_an_axis_whose_noise_is_understated_is_named(advice):
     assert not [text for text in texts if text.startswith('linear')]
 
 
-def test_points_whose_noise_is_understated_are_named(advice):
-    texts = advice(range_noise=0.01, bearing_noise=0.003)
+def test_points_whose_noise_is_understated_are_named(advice, tmp_path):
+    beginning = write_beginning(tmp_path / 'beginning.mcap', SAMPLE, 40.0)
+    texts = advice(beginning, range_noise=0.01, bearing_noise=0.003)
     assert any('noise of the points' in text for text in texts)
     assert not any('noise of the velocity (' in text for text in texts if 'While' not in text)

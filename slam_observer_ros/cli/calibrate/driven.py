@@ -61,8 +61,9 @@ def opened(
 ) -> Settings:
     """Return settings that know little of all that is calibrated, but for those to be ``kept``.
 
-    Without a surveyed map the scale of ranges is as stated: nothing shows how large a map is, but
-    noise stated in metres makes a smaller one more likely. Noise in proportion to the speed is
+    With neither a surveyed map nor a scale of the wheels that is known, that of ranges is as
+    stated: nothing shows how large a map is, but noise in metres, which makes a smaller one more
+    likely. Noise in proportion to the speed is
     taken to be the same all the time: as noisy velocities state it, those too small by chance
     would weigh more, and scales come out too large.
     """
@@ -81,7 +82,7 @@ def opened(
     wide: dict[str, Any] = {
         name: _at_least(getattr(settings, name), value) for name, value in least.items()
     }
-    if not is_surveyed:
+    if not is_surveyed and 'linear_scale_stddev' not in kept:
         wide['range_scale_stddev'] = 0.0
     wide |= {
         'angular_scale_stddev': tuple(scales[:3].tolist()),

@@ -15,6 +15,7 @@ from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.message_types import short_names
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import from_parameters, table, Value
 
@@ -85,22 +86,21 @@ class ReplayRequest:
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that of topics and inputs, which tune has, too."""
+    landmarks, ambiguous = (
+        ', '.join(short_names('landmarks', is_ambiguous)) for is_ambiguous in (False, True)
+    )
     topics = parser.add_argument_group(
         'topics', 'found by their types; a name is needed only where two fit'
     )
     for option, what in (
-        ('--velocity-topic', 'Twist, TwistStamped, TwistWithCovarianceStamped or Odometry'),
+        ('--velocity-topic', ', '.join(short_names('velocity'))),
         (
             '--landmarks-topic',
-            'PointCloud or PointCloud2 with ids, Detection3DArray, AprilTagDetectionArray, '
-            'ArucoDetection or ArucoMarkers; if named here or called landmarks, also clouds '
-            'without ids and PoseArray; if named, /tf with fiducials',
+            f'{landmarks}, clouds with ids; if named here or called landmarks, also clouds '
+            f'without, and {ambiguous}; if named, /tf with fiducials',
         ),
         ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
-        (
-            '--pose-truth-topic',
-            'true pose: PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry',
-        ),
+        ('--pose-truth-topic', f'true pose: {", ".join(short_names("pose"))}'),
         ('--landmark-truth-topic', 'true landmarks'),
     ):
         topics.add_argument(option, type=named, metavar='TOPIC', help=what)

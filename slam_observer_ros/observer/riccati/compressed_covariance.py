@@ -43,7 +43,7 @@ REFERENCE_SHIFT_M = 0.1
 CHECK_INTERVAL = 20
 """Corrections in which that is looked at, of each landmark once."""
 
-CHANGE_INTERVAL = 32
+CHANGE_INTERVAL = 64
 """Corrections in which a change comes to all landmarks, if no other one has to begin before."""
 
 FOLDING = 3e7
@@ -73,7 +73,7 @@ class CompressedCovariance(JointCovariance):
         n = len(observer.y_ref)
         self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
         self._set_active(np.arange(n), n)
-        self._outside = OutsideLandmarks(self._axes, self._stride, len(self.P))
+        self._outside = OutsideLandmarks(self.chart, len(self.P))
         # (n,) where each landmark is outside, −1 for nowhere; and (slots,) which ones are there
         self._slots = np.full(n, -1)
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
@@ -454,8 +454,6 @@ class CompressedCovariance(JointCovariance):
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]
         own = symmetric(to_x[:, columns] - to_x[:, :p] @ T.T)
-        outputs = np.eye(len(P))[:, columns]
-        outputs[:p] -= T.T
         kept = np.delete(np.arange(len(P)), columns)
         slots = all_slots[released]
         change = Change(
@@ -467,7 +465,8 @@ class CompressedCovariance(JointCovariance):
             slots,
             points,
             outside.rows(slots),
-            outputs,
+            columns,
+            T,
             own,
             to_x[:, kept],
         )

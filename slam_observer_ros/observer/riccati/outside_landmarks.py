@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
+from slam_observer_ros.observer.chart import Chart
 from slam_observer_ros.observer.riccati.panel_matrix import PANEL_ROWS, PanelMatrix
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 
@@ -32,7 +32,8 @@ class Change:
     slots: IntArray  # (m,) landmarks that are not in x any more, ascending
     points: FloatArray  # (m, 3) their references
     rows: IntArray  # (m k,) and rows
-    outputs: FloatArray  # (q, m k): their covariance with others is that of x times this
+    columns: IntArray  # (m k,) and entries of x
+    turning: FloatArray  # (m k, p) T of η = ξ − T ε
     own: FloatArray  # (m k, m k) their own
     to_x: FloatArray  # (m k, …) and with the entries that stay
 
@@ -84,8 +85,8 @@ class OutsideLandmarks:
     that have been taken in since.
     """
 
-    def __init__(self, axes: EstimatedAxes, stride: int, size: int) -> None:
-        self._axes, self._stride = axes, stride
+    def __init__(self, chart: Chart, size: int) -> None:
+        self._chart, self._axes, self._stride = chart, chart.axes, chart.stride
         self.matrix = PanelMatrix()  # B
         self.panels: list[Panel] = []
         self.size = size  # q₀
@@ -241,12 +242,12 @@ class OutsideLandmarks:
         turns = change.postponed.turns(each[:, k:], panel.turned, self._axes)
         s = len(change.turns)
         D = np.zeros((PANEL_ROWS, s))
-        D.reshape(len(points), self._stride, s)[:, :k] = self._axes.turn_matrix(off)[:, :, :s]
+        D.reshape(len(points), self._stride, s)[:, :k] = -self._chart.still(off)[:, :, :s]
         # … D Zᵀ + Z Dᵀ, as the difference of two squares.
         Z = X[:, :s] + 0.5 * D @ change.turns[:, :s]
         U = np.hstack([before @ change.root, D + Z, D - Z])
         X += D @ change.turns
-        V = X @ change.outputs
+        V = X[:, change.columns] - X[:, : change.turning.shape[1]] @ change.turning.T
         X = X[:, change.kept]
         blocks = U.reshape(len(points), self._stride, U.shape[1])
         own = panel.own + (blocks * change.weights) @ transpose(blocks)

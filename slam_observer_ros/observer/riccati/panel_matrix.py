@@ -1,21 +1,21 @@
 """A large symmetric matrix to which products of low rank are added, a little at a time.
 
-It is M = B + U diag(w) Uᵀ. Of B the rows up to the diagonal are kept, in panels of several rows;
-so it grows without a copy, and takes half the memory. U has what is yet to be added to B, which
-costs O(N²) for N rows: that is done panel by panel (:meth:`PanelMatrix.fold`). So is U itself
-made: columns that are *begun* have been given to some panels, and not yet to others, of which M is
-then still what it was before. Copies share what they have until they change it.
+It is M = B + U diag(w) Uᵀ. Rows are in panels, and of B those up to the diagonal are kept, in
+square tiles; so it grows without a copy, and takes half the memory. U has what is yet to be added
+to B, which costs O(N²) for N rows: that is done panel by panel (:meth:`PanelMatrix.fold`). So is U
+itself made: columns that are *begun* have been given to some panels, and not yet to others, of
+which M is then still what it was before. No array is changed in place: copies share them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from itertools import pairwise
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.observer.riccati.shared_array import SharedArray
 
 PANEL_ROWS = 96
 """Rows of a panel: landmarks do not straddle two, in space or in a plane, points or tags."""
@@ -28,30 +28,29 @@ class PanelMatrix:
     """M (N, N) with N a multiple of ``PANEL_ROWS``; at first there is none."""
 
     def __init__(self) -> None:
-        self._panels: list[SharedArray] = []  # (PANEL_ROWS, rows up to its last) of B
+        # Of each panel the tiles (PANEL_ROWS, PANEL_ROWS) of B up to that on the diagonal
+        self._tiles: list[list[FloatArray]] = []
+        self._zeros = np.zeros((PANEL_ROWS, PANEL_ROWS))
         self._folded: list[int] = []  # how many columns of U are already in each panel
-        # (PANEL_ROWS, …) rows of U; never changed in place: copies share them.
-        self._U: list[FloatArray] = []
+        self._U: list[FloatArray] = []  # (PANEL_ROWS, …) rows of U
         self._w: FloatArray = np.zeros(0)
         self._rank = 0  # columns of U that all panels have
         self._next = self._target = 0  # the next panel to be folded, up to which column
 
     def __len__(self) -> int:
         """Return how many panels there are."""
-        return len(self._panels)
+        return len(self._tiles)
 
     def copy(self) -> PanelMatrix:
         """Return an independent copy."""
-        other = PanelMatrix()
-        vars(other).update(vars(self))
-        other._panels = [panel.share(other) for panel in self._panels]
+        other = copy(self)
+        other._tiles = [tiles.copy() for tiles in self._tiles]
         other._folded, other._U = self._folded.copy(), self._U.copy()
         return other
 
     def append(self) -> None:
         """Append a panel of zeros."""
-        panel = np.zeros((PANEL_ROWS, PANEL_ROWS * (len(self) + 1)))
-        self._panels.append(SharedArray(panel, self))
+        self._tiles.append([self._zeros] * (len(self) + 1))
         self._folded.append(self._rank)
         self._U.append(np.zeros((PANEL_ROWS, len(self._w))))
 
@@ -61,38 +60,37 @@ class PanelMatrix:
         ``U`` are its rows of U if these are not those that it has.
         """
         found = np.empty((PANEL_ROWS, len(indices)))
-        own, panel = self._of(number), self._panels[number].array
         for part, other, local in _by_panel(indices):
+            found[:, part] = self._pending(number, other, local, U)
             if other <= number:
-                found[:, part] = panel[:, indices[part]]
+                found[:, part] += self._tiles[number][other][:, local]
             else:
-                found[:, part] = self._panels[other].array[local, own].T
-            found[:, part] += self._pending(number, other, local, U)
+                found[:, part] += self._tiles[other][number][local].T
         return found
 
     def set_columns(self, number: int, indices: IntArray, values: FloatArray) -> None:
         """Replace them by ``values`` (PANEL_ROWS, m), and with them the same rows."""
-        own, panel = self._of(number), self._writable(number)
         for part, other, local in _by_panel(indices):
             new = values[:, part] - self._pending(number, other, local)
+            tile = self._writable(max(number, other), min(number, other))
             if other <= number:
-                panel[:, indices[part]] = new
+                tile[:, local] = new
             if other >= number:
-                self._writable(other)[local, own] = new.T
+                tile[local] = new.T
 
     def add_blocks(self, number: int, rows: IntArray, blocks: FloatArray) -> None:
         """Add blocks (m, k, k) on the diagonal, in rows (m, k) of a panel."""
-        columns = rows + PANEL_ROWS * number
-        self._writable(number)[rows[:, :, None], columns[:, None, :]] += blocks
+        self._writable(number, number)[rows[:, :, None], rows[:, None, :]] += blocks
 
     def among(self, indices: IntArray, U: FloatArray) -> FloatArray:
         """Return M (m, m) at ascending ``indices`` (m,), which have the rows ``U`` of U."""
         found, w = np.empty((len(indices),) * 2), self._w
         for part, number, local in _by_panel(indices):
-            left, f = slice(part.stop), self._folded[number]
-            rows = self._panels[number].array[np.ix_(local, indices[left])]
-            rows += (U[part, f:] * w[f:]) @ U[left, f:].T
-            found[part, left], found[left, part] = rows, rows.T
+            f = self._folded[number]
+            for left, other, of_left in _by_panel(indices[: part.stop]):
+                block = self._tiles[number][other][np.ix_(local, of_left)]
+                block += (U[part, f:] * w[f:]) @ U[left, f:].T
+                found[part, left], found[left, part] = block, block.T
         return found
 
     @property
@@ -134,11 +132,14 @@ class PanelMatrix:
         self._next += 1
         if f >= t:
             return 0.0
-        panel, U = self._writable(number), self._U[number][:, f:t] * self._w[f:t]
-        for other in range(number + 1):
-            panel[:, self._of(other)] += U @ self._U[other][:, f:t].T
+        tiles, U = self._tiles[number], self._U[number][:, f:t] * self._w[f:t]
+        if U.any():
+            for other, tile in enumerate(tiles):
+                added = U @ self._U[other][:, f:t].T
+                added += tile
+                tiles[other] = added
         self._folded[number] = t
-        return float(panel.size * (t - f))
+        return float(len(tiles) * PANEL_ROWS**2 * (t - f))
 
     def _drop_folded(self) -> None:
         """Drop the columns that all panels have in B."""
@@ -157,12 +158,10 @@ class PanelMatrix:
         pending: FloatArray = (U[:, f:until] * self._w[f:until]) @ right.T
         return pending
 
-    def _of(self, number: int) -> slice:
-        return slice(PANEL_ROWS * number, PANEL_ROWS * (number + 1))
-
-    def _writable(self, number: int) -> FloatArray:
-        self._panels[number] = panel = self._panels[number].owned_by(self)
-        return panel.array
+    def _writable(self, number: int, other: int) -> FloatArray:
+        tile: FloatArray = self._tiles[number][other].copy()
+        self._tiles[number][other] = tile
+        return tile
 
 
 def _by_panel(indices: IntArray) -> Iterator[tuple[slice, int, IntArray]]:

@@ -143,7 +143,7 @@ class RiccatiFilter(OrientationGains):
 
     def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:
         # C as the prediction has it: in the middle between where landmarks are expected and seen.
-        C = self.axes.output_matrix(residuals.e - 0.5 * residuals.r + residuals.a)
+        C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
         self.motion_noise.factors.learn(r, S, C)
 
     def distances(self, residuals: Residuals) -> FloatArray:
@@ -218,7 +218,7 @@ class RiccatiFilter(OrientationGains):
         self.joint = joint = self.joint.dense()
         k = self.axes.point
         G = joint.chart.gauge(len(self.observer))
-        J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
+        J = joint.chart.moved(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
         HP, HPH = joint.project(joint.chart.still(self.observer.points[rows]), rows)  # of −ã_i
         R = block_diagonal(covariances[:, :k, :k])
@@ -321,12 +321,13 @@ class RiccatiFilter(OrientationGains):
         return self.joint.followed(rows, super().translations(rows))
 
     def _compress_if_large(self, added: int) -> None:
-        """Go on with a covariance for many landmarks, unless they move."""
+        """Go on with a covariance for many landmarks, unless they move or P has none of them."""
         # Tags count by what is estimated of them: relinearising ends there, too.
         count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
         is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        if self.joint.is_dense and is_large and not may_move:
+        has_them = self.joint.is_dense and not isinstance(self.joint, ExactMapCovariance)
+        if has_them and is_large and not may_move:
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
