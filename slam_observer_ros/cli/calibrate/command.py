@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from slam_observer_ros.cli.calibrate.finder import Finder
+from slam_observer_ros.cli.calibrate.finder import Finder, growth
 from slam_observer_ros.cli.calibrate.stated import (
     depth_text,
     Found,
@@ -123,11 +123,15 @@ def run(args: argparse.Namespace) -> None:
         pose = _sensor_pose(request, found)
         stated = state_found(request.settings, request.inputs, found, pose)
         stated, verdict = _judged(request, args.hold_out, material, stated, found)
-    _print(args, material, found, stated, verdict)
+        trained_on = read_material(replace(request, inputs=stated.inputs), share, survey)
+        gain = growth(
+            material.likelihood(request.settings), trained_on.likelihood(stated.settings)
+        )
+    _print(args, material, found, stated, gain, verdict)
     if verdict.objection:
         raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
     if args.out is not None:
-        _write(args, given, material, found, stated, verdict)
+        _write(args, given, material, stated, gain, verdict)
 
 
 def _sensor_pose(request: ReplayRequest, found: Found) -> FloatArray | None:
@@ -176,6 +180,7 @@ def _print(
     material: Material,
     found: Found,
     stated: Stated,
+    gain: tuple[float, float],
     verdict: Verdict,
 ) -> None:
     """Print what was found, how well it is known, and how it does on what was held out."""
@@ -195,7 +200,7 @@ def _print(
                 'trades': [asdict(trade) for trade in found.trades],
                 'range_is_depth': found.range_is_depth,
                 'depth_gain': found.depth_gain,
-                'log_likelihood_gain': found.gain,
+                'log_likelihood_gain': gain,
                 'noise_log_factors': {kind.name: [log, d] for kind, log, d in found.noise},
                 'motion_factors': {part.name: asdict(part) for part in found.factors},
                 'parameters': parameters,
@@ -214,7 +219,7 @@ def _print(
     to_do = [*of_mounting(found.parts), *of_noise(found.factors)]
     lines |= {f'to do: {finding.what}': finding.remedy for finding in to_do}
     lines |= _open_questions(found)
-    lines['log likelihood, gain'] = '{:.1f} ± {:.1f}'.format(*found.gain)
+    lines['log likelihood, gain'] = '{:.1f} ± {:.1f}'.format(*gain)
     lines |= {f'held out: {name}': text for name, text in verdict_lines(verdict).items()}
     print_table('what it says', lines)
 
@@ -234,8 +239,8 @@ def _write(
     args: argparse.Namespace,
     given: Given,
     material: Material,
-    found: Found,
     stated: Stated,
+    gain: tuple[float, float],
     verdict: Verdict,
 ) -> None:
     """Write the parameter file."""
@@ -244,7 +249,7 @@ def _write(
     head = [
         f'By slam-observer calibrate {VERSION} from',
         f'  {material.path.name} (SHA-256 {material.sha256}) in {where}',
-        'log likelihood, gain: {:.1f} ± {:.1f}'.format(*found.gain),
+        'log likelihood, gain: {:.1f} ± {:.1f}'.format(*gain),
         *judged_lines(held_out, verdict),
         'Values ± their standard deviations; what the recording says little of is as it was.',
     ]

@@ -57,10 +57,8 @@ class Finder:
 
     def find(self, keeps_noise: bool = False) -> Found:
         """Return what is found; a UsageError says if there is too little to see."""
-        # As stated, but where a map is known: there no landmark is new.
-        mode = self._open.localization_mode
-        _, before = self._run(replace(self._stated, localization_mode=mode))
-        if not before.count:
+        _, likelihood = self._run(self._open)
+        if not likelihood.count:
             raise UsageError(f'{self._material.path}: nothing is seen twice in what is trained on')
         settings, depth_gain = self._depth_or_range(self._open)
         delay = self._delay(settings)
@@ -71,7 +69,7 @@ class Finder:
             )
         noise = [] if keeps_noise else self._noise(settings)
         settings = scaled(settings, [kind for kind, *_ in noise], [log for _, log, _ in noise])
-        estimator, after = self._run(settings)
+        estimator, _ = self._run(settings)
         # A filter seems to know what only shows where it has linearised: a common scale.
         smoothed = estimator.smooth()
         parts = [self._part(part, delay) for part in smoothed.calibration]
@@ -83,7 +81,6 @@ class Finder:
             pairs,
             settings.range_is_depth,
             depth_gain,
-            _gain(before, after),
             noise,
             estimator.motion_factors,
             self._too_noisy(),
@@ -109,7 +106,7 @@ class Finder:
         (_, of_range), (_, of_depth) = (
             self._run(replace(settings, range_is_depth=is_depth)) for is_depth in (False, True)
         )
-        gain, deviation = _gain(of_range, of_depth)
+        gain, deviation = growth(of_range, of_depth)
         if 'range_is_depth' not in self._kept and abs(gain) > SURE * deviation:
             settings = replace(settings, range_is_depth=gain > 0.0)
         return settings, (gain, deviation)
@@ -207,6 +204,7 @@ def _may_be_depth(material: Material) -> bool:
     return bool(np.mean(np.concatenate(behind)) <= MAX_BEHIND)
 
 
-def _gain(before: Likelihood, after: Likelihood) -> tuple[float, float]:
+def growth(before: Likelihood, after: Likelihood) -> tuple[float, float]:
+    """Return by how much a log likelihood grows, and the deviation of that."""
     verdict = judge([Judged(before, None, None)], [Judged(after, None, None)])
     return verdict.gain, verdict.gain_deviation

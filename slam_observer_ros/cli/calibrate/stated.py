@@ -35,13 +35,12 @@ Values = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What was found; ``gains`` are of the log likelihood, with their standard deviations."""
+    """What was found; the ``depth_gain`` is of the log likelihood, and has its deviation."""
 
     parts: list[CalibrationEstimate]  # c
     trades: list[Trade]
     range_is_depth: bool
     depth_gain: tuple[float, float] | None  # of depth over range; None if it can't be
-    gain: tuple[float, float]  # of all over what was stated
     noise: list[tuple[NoiseKind, float, float]]  # of points: ln factor and its deviation
     factors: list[MotionFactor]
     too_noisy: list[str]  # scales of velocities that were not looked for
@@ -152,7 +151,8 @@ def depth_text(found: Found) -> str:
         return 'range: what is seen is all around'
     what = 'depth along the axis' if found.range_is_depth else 'range'
     gain, deviation = found.depth_gain
-    return f'{what}: the log likelihood of depth is {gain:+.0f} ± {deviation:.0f} over range'
+    kept = '' if found.range_is_depth == (gain > 0.0) else ', which is not sure, or was not asked'
+    return f'{what}: the log likelihood of depth is {gain:+.0f} ± {deviation:.0f} over range{kept}'
 
 
 def _entry_of(name: str) -> tuple[str, int | None]:
