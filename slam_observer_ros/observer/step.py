@@ -249,7 +249,7 @@ class _Residuals(NamedTuple):
         return self.r[:, : self.axes.point].ravel()
 
     def output_matrix(self, chord: float) -> FloatArray:
-        """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, ``chord`` of the way from ŷ_i to the point."""
+        """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, ``chord`` of the way from ŷ_i to y."""
         C = self.axes.output_matrix(chord * self.r)
         C = C if self.D is None else np.concatenate([C, self.D], axis=2)
         return C.reshape(len(self.columns), -1)
