@@ -1,9 +1,9 @@
 /* The usual step in C: the functions of step.py once more, in that order and by the same names.
  *
- * advance() moves a state along velocities (27), observe() by the innovation (28)-(31), both on the
- * arrays of flat_arrays.py. Whatever is unusual returns UNUSUAL before anything is changed, and
- * Python goes on over the same arrays. What the equations mean, and the units, are said in step.py;
- * a change is made in both, and test/observer/test_core.py holds each step of either to the other.
+ * advance() moves a state along velocities (27), observe() by the innovation (28)-(31), both on
+ * the arrays of flat_arrays.py. Whatever is unusual returns UNUSUAL before anything is changed:
+ * Python goes on over the same arrays. What the equations mean, and the units, step.py says; a
+ * change is made in both, and test/observer/test_core.py holds each step of either to the other.
  *
  * All that could be read or written beyond an array's end is checked when the arrays come in, in
  * the functions named read_...; nothing is checked after them. Nothing is kept from call to call.
@@ -509,7 +509,8 @@ typedef struct {
     int moves;
 } Piece;
 
-static long rows_up_to(const i64 *stamps_ns, long count, i64 stamp_ns, int and_at) { /* bisection */
+/* How many entries are before a stamp, or also at it: bisection. */
+static long rows_up_to(const i64 *stamps_ns, long count, i64 stamp_ns, int and_at) {
     long low = 0, high = count;
     while (low < high) {
         long middle = low + (high - low) / 2;
@@ -570,7 +571,9 @@ static void sum_up(Piece *pieces, long k) {
     }
 }
 
-static double time_at(const Piece *pieces, long pose) { return pose ? pieces[pose - 1].until_s : 0.0; }
+static double time_at(const Piece *pieces, long pose) {
+    return pose ? pieces[pose - 1].until_s : 0.0;
+}
 
 static double moved_at(const Piece *pieces, long pose, int axis) {
     return pose ? pieces[pose - 1].moved[axis] : 0.0;
@@ -912,7 +915,7 @@ static int is_zero(const double C[9]) {
     return 1;
 }
 
-/* That of a point y as stated, such that it can be inverted; by the figures where it is unknown. */
+/* That of a point y as stated, such that it can be inverted; by the figures if it is unknown. */
 static void stated_covariance(const double y[3], const double stated[9], const double line[3],
                               const PointFigures *figures, double C[9]) {
     if (is_zero(stated)) {

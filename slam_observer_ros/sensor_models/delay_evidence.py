@@ -70,7 +70,7 @@ class DelayEvidence:
         in_force_s = _overlaps(stamps, *centres_ns) / NANOSECONDS_PER_SECOND
         period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) / NANOSECONDS_PER_SECOND
         # How much noise there is: as stated, or less where velocities differ less.
-        steps = np.sort(np.abs(np.diff(V, axis=0)), axis=0)[(len(V) - 1) // 2]
+        steps = np.sort(np.abs(V[1:] - V[:-1]), axis=0)[(len(V) - 1) // 2]
         self._used += 1
         self._steps[axes] += (steps - self._steps[axes]) / self._used
         found = 0.5 * (_PER_MEDIAN * self._steps[axes]) ** 2 * period_s
@@ -107,6 +107,9 @@ def _weights(stamps: IntArray, centre_ns: int, reach_ns: int, known_ns: int) -> 
 
 def _overlaps(stamps: IntArray, start_ns: int, end_ns: int) -> IntArray:
     """Return for how long (m,) each velocity was in force between two stamps, nanoseconds."""
-    bounds = np.clip(np.append(stamps, end_ns), start_ns, end_ns)
-    overlaps: IntArray = np.maximum(np.diff(bounds), 0)
+    # A fifth of what np.append, np.clip and np.diff cost, of so few.
+    bounds = np.empty(len(stamps) + 1, dtype=np.int64)
+    bounds[:-1], bounds[-1] = stamps, end_ns
+    bounds = np.minimum(np.maximum(bounds, start_ns), end_ns)
+    overlaps: IntArray = bounds[1:] - bounds[:-1]
     return overlaps

@@ -10,7 +10,8 @@ import pytest
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -63,6 +64,21 @@ def test_who_looks_at_the_map_does_not_change_it():
     np.testing.assert_array_equal(unseen.pose, looked_at.pose)
     np.testing.assert_array_equal(unseen.world_points, looked_at.world_points)
     np.testing.assert_array_equal(unseen.pose_covariance, looked_at.pose_covariance)
+
+
+def test_a_sensor_is_calibrated_in_a_large_map_that_is_exact():
+    settings = replace(SETTINGS, localization_mode='fixed', sensor_rotation_stddev=(0.02,) * 3)
+    rng, estimator = np.random.default_rng(0), Estimator(settings)
+    points = rng.uniform(-5.0, 5.0, (20, 3))
+    known = LandmarkMap(np.arange(20), points, np.zeros((20, 3, 3)), np.ones(20, dtype=np.int64))
+    estimator.load_map(known, np.eye(4))
+    for k in range(20):
+        estimator.add(VelocityEvent(k * 10**8, np.zeros(6)))
+        seen = points[:5] + 0.01 * rng.standard_normal((5, 3))
+        event = ObservationEvent(k * 10**8, np.arange(5), seen, sensor_frame='camera')
+        estimator.add(event)
+    assert np.linalg.norm(estimator.pose[:3, 3]) < 0.05
+    assert any('camera' in entry.name for entry in estimator.calibration)
 
 
 def test_all_can_be_smoothed_until_the_history_would_begin_again():

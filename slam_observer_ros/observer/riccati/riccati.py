@@ -321,12 +321,13 @@ class RiccatiFilter(OrientationGains):
         return self.joint.followed(rows, super().translations(rows))
 
     def _compress_if_large(self, added: int) -> None:
-        """Go on with a covariance for many landmarks, unless they move."""
+        """Go on with a covariance for many landmarks, unless they move or P has none of them."""
         # Tags count by what is estimated of them: relinearising ends there, too.
         count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
         is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        if self.joint.is_dense and is_large and not may_move:
+        has_them = self.joint.is_dense and not isinstance(self.joint, ExactMapCovariance)
+        if has_them and is_large and not may_move:
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
