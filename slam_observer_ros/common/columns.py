@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import numpy as np
@@ -46,9 +46,14 @@ class LandmarkColumns:
         other._show(self._count)
         return other
 
-    def __deepcopy__(self, _memo: object) -> Self:
-        """Return :meth:`copy`: copied one by one, the attributes would be views no more."""
-        return self.copy()
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """Return a copy whose columns are views again, and which shares what others share."""
+        memo[id(self)] = other = copy(self)
+        for name, value in vars(self).items():
+            if name not in self.COLUMNS:
+                setattr(other, name, deepcopy(value, memo))
+        other._show(self._count)
+        return other
 
     def append_zeros(self, m: int) -> IntArray:
         """Append rows; return which (m,)."""

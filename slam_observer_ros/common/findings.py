@@ -331,7 +331,7 @@ KINDS = {
     'carried_landmark': Kind(
         Level.WARNING,
         'landmarks {ids} move with the robot, and are not used',
-        'nothing is wrong if it carries them; where they stay behind they are used again',
+        'do nothing if it carries them; where they stay behind they are used again',
     ),
     'many_moved': Kind(
         Level.WARNING,

@@ -71,15 +71,18 @@ def table_rows(path: Path, left_out: list[str]) -> list[Row]:
         return []
     if ',' not in text and _is_of_fiducial_slam(lines[0][1]):
         return [_fiducial_slam_row(number, cells) for number, cells in lines]
-    names, scales = list(COLUMNS), [1.0] * len(COLUMNS)
+    names, scales, least = list(COLUMNS), [1.0] * len(COLUMNS), 0
     if not _is_number(lines[0][1][0]):
         names, scales = _columns(lines.pop(0)[1])
+        least = 1 + names.index('z') if 'z' in names else 0
     left_out += _unused(names, lines)
     rows = []
     for number, cells in lines:
         with naming(f'line {number}'):
             if any(cells[len(names) :]):
                 raise MapError(f'it has more values than columns, which are {", ".join(names)}')
+            if len(cells) < least:  # as where a file was cut: z would pass for 0
+                raise MapError(f'it has fewer values than columns, which are {", ".join(names)}')
             scaled = dict(zip(names, zip(cells, scales, strict=False), strict=False))
             rows.append(_row({name: cell for name, cell in scaled.items() if cell[0]}))
     return rows

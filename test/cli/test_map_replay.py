@@ -187,10 +187,14 @@ def test_of_a_folder_of_maps_it_is_said_in_which_the_robot_was_found(slam_observ
     ended = slam_observer(*arguments, '--tum', halls / 'east.yaml', '--force')
     assert ended.code == 2
     assert 'the file of --load-map' in ended.errors
-    write_map(halls / 'west.yaml', LandmarkMap(np.arange(50), other, None, known.counts), None)
-    ended = slam_observer(*arguments)
+    for name in ('east', 'west'):  # with ids, and halls that are the same
+        known = LandmarkMap(np.arange(50), LANDMARKS, None, known.counts)
+        write_map(halls / f'{name}.yaml', known, None)
+    with_ids = record(tmp_path / 'ids.mcap', np.eye(4), seed=1)
+    ended = slam_observer('replay', with_ids, '--load-map', halls, *SETTINGS)
     assert ended.code == 2
-    assert 'was not found: what was seen fits no place in the 2 maps yet' in ended.errors
+    assert 'rad) in east' in ended.errors
+    assert 'rad) in west' in ended.errors
 
 
 class TestPoseInMapNotKnown:

@@ -332,6 +332,7 @@ def test_what_was_imported_can_be_saved_and_loaded(load, tmp_path):
         (BUNDLE.replace('id: 11, ', ''), 'tags.yaml', "'id' is missing"),
         ('tag_bundles: [{layout: []}, {layout: []}]', 'tags.yaml', 'it has 2 bundles, each in a'),
         ('7,1,2,3,0,0,0,1\n', 'tags.csv', 'line 1: it has more values than columns'),
+        ('id,x,y,z\n7,1,2,3\n8,1,2\n', 'tags.csv', 'line 3: it has fewer values than columns'),
         (
             'id,x,y,qx,qy,qz\n7,1,2,0,0,1\n',
             'tags.csv',

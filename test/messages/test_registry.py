@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib.util import module_from_spec, spec_from_file_location
-import json
 from pathlib import Path
 import re
 import struct
@@ -55,7 +54,6 @@ def fixture_beacons(tmp_path):
     spec = spec_from_file_location('slam_observer_ros.messages.beacons', path)
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module
 
 
 def beacon_message(stamp_ns, seen):
@@ -102,7 +100,8 @@ def write_beacons(path):
     return record(path, BEACONS, messages)
 
 
-def test_the_example_of_contributing_is_all_that_a_landmark_type_takes(beacons, tmp_path, capsys):
+@pytest.mark.usefixtures('beacons')
+def test_the_example_of_contributing_is_all_that_a_landmark_type_takes(tmp_path, capsys):
     path = write_beacons(tmp_path / 'run.mcap')
     options = ('--set', 'landmarks_type=BeaconArray', '--set', 'sensor_frame=base_link', '--json')
     for chosen in (options, options[2:]):  # named, and found by its type
@@ -115,17 +114,13 @@ def test_the_example_of_contributing_is_all_that_a_landmark_type_takes(beacons, 
     expected = recordings.LANDMARKS.world_points * np.array([1.0, 1.0, 0.0])
     assert_array_equal(seen[0].ids, recordings.LANDMARKS.ids)
     np.testing.assert_allclose(seen[0].points, expected, atol=1e-6)
-    assert beacons.__doc__
 
 
-def test_parameters_and_help_offer_a_type_and_an_unread_one_is_said_to_be_none(
-    beacons, tmp_path, capsys
-):
+@pytest.mark.usefixtures('beacons')
+def test_parameters_and_help_offer_a_type_and_an_unread_one_is_said_to_be_none(tmp_path, capsys):
     helped = CommandLine(capsys)('replay', '--help').output
-    assert (
-        'BeaconArray'
-        in helped.rpartition('--landmarks-topic TOPIC')[2].partition('--imu TOPIC')[0]
-    )
+    of_landmarks = helped.rpartition('--landmarks-topic TOPIC')[2]
+    assert 'BeaconArray' in of_landmarks.partition('--imu TOPIC')[0]
     assert 'BeaconArray' in choices(InputSettings, 'landmarks_type')
     assert 'BeaconArray' in choices(ObserverNodeSettings, 'landmarks_type')
     del message_types._REGISTERED['landmarks', BEACONS]
@@ -135,7 +130,6 @@ def test_parameters_and_help_offer_a_type_and_an_unread_one_is_said_to_be_none(
     ):
         recording.find_topics()
     assert 'BeaconArray' not in choices(InputSettings, 'landmarks_type')
-    assert beacons.decode_beacons
 
 
 def test_two_decoders_of_one_type_are_a_mistake():
@@ -193,10 +187,10 @@ def test_a_velocity_type_takes_its_decoder_alone_and_is_read_in_blocks_if_that_c
     assert_array_equal([event.body_velocity for event in velocities], expected)
 
 
-def test_what_doctor_hears_is_what_is_registered(beacons):
+@pytest.mark.usefixtures('beacons')
+def test_what_doctor_hears_is_what_is_registered():
     live_inputs = pytest.importorskip('slam_observer_ros.nodes.live_inputs')
     heard = live_inputs.HeardTopic('/beacons', BEACONS, 1.0)
     heard.take(beacon_message(ros.STAMP_NS, [(3, 2.0, 0.0)]))
     assert heard.role == 'landmarks'
     assert "1 points, 1 with an id, in 'mast', as landmarks with -r" in heard.text()
-    assert json.dumps(beacons.__doc__)

@@ -17,8 +17,8 @@ from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.health import of_fit, of_left_out, of_rejections
 
 IMPERATIVES = re.compile(
-    r'(add|check|drive|give|is|let|look|mind|only|record|resume|see|send|set|state|synchronise|to '
-    r'keep|try|use|has|are|did|if|some|max_landmarks|where)\b'
+    r'(add|check|do|drive|give|is|let|look|mind|only|record|resume|see|send|set|state|synchronise|'
+    r'to keep|try|use|has|are|did|if|some|max_landmarks|where)\b'
 )
 """How a remedy begins: it says what to do, or asks what to look at."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 import inspect
 from typing import ClassVar
 
@@ -77,6 +78,19 @@ def test_a_copy_of_a_state_and_the_state_change_apart_and_alike(run):
     np.testing.assert_equal(known_of(one), before)
     for event in events[half:]:
         one.add(event)
+    np.testing.assert_equal(known_of(one), known_of(other))
+
+
+def test_a_deep_copy_of_an_estimator_has_one_owner_too(run):
+    settings, events = run
+    one, half = Estimator(settings), len(events) // 2
+    for event in events[:half]:
+        one.add(event)
+    other = deepcopy(one)
+    for event in events[half:]:
+        one.add(event)
+        other.add(event)
+    other._hypotheses._all = [hypothesis.copy() for hypothesis in other._hypotheses._all]
     np.testing.assert_equal(known_of(one), known_of(other))
 
 

@@ -158,8 +158,9 @@ class DiagnosticsPublisher:
         if not self._estimator.is_localised:
             findings.append(found('unknown_pose'))
             # Landmarks that came without an id have one that was given here.
-            if is_automatic(self._estimator.landmark_ids).any():
-                problem = self._estimator.localisation_problem
+            estimator = self._estimator
+            if is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses):
+                problem = estimator.localisation_problem
                 findings.append(found('ambiguous_pose', problem=problem))
         return findings
 
