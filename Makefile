@@ -30,10 +30,10 @@ help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
 
 demo: $(READY) $(CORE)  ## run simulator and observer until they converge; pictures in demo_output/
-	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.demo
+	$(PYTHON_IN_VENV) demo/demo.py
 
 robot: $(READY) $(CORE)  ## localise a simulated robot among AprilTags, as for Nav2; OPTIONS=--help
-	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.robot $(OPTIONS)
+	$(PYTHON_IN_VENV) demo/robot.py $(OPTIONS)
 
 test: lint pytest colcon  ## everything that a change must pass
 

@@ -104,7 +104,6 @@ setup(
             f'observer_node = {PACKAGE}.nodes.executables:observer_node',
             f'lifecycle_observer_node = {PACKAGE}.nodes.executables:lifecycle_observer_node',
             f'simulator_node = {PACKAGE}.nodes.executables:simulator_node',
-            f'demo = {PACKAGE}.nodes.demo.demo:main',
         ],
     },
 )

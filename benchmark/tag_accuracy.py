@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 import sys
 
@@ -18,10 +19,12 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'demo'))
+hall = import_module('hall')
 
 PARAMS_FILE = Path(__file__).resolve().parents[1] / 'config' / 'tags_on_tf.yaml'
 EVERY = (4, 2, 1)

@@ -8,7 +8,9 @@ carried elsewhere, which its wheels do not notice.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
+import sys
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -29,10 +31,12 @@ from slam_observer_ros.evaluation.plots.drawing import (
 )
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'demo'))
+hall = import_module('hall')
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 IMAGE = CHECKOUT / 'docs' / 'images' / 'reflectors.png'

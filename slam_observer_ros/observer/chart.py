@@ -2,7 +2,7 @@
 
     x = (ε, c̃, then of each landmark ξ_i, and ω_i or ũ_i where these are estimated)
 
-    Â = exp(ε) A,       ξ_i = ã_i + [ŷ_i]× ε_Ω,       B̂_i = exp(ω_i) B_i,       ũ_i = û_i − R_Ã u_i
+    Â = exp(ε) A,     ξ_i = ã_i + [ŷ_i]× ε_Ω,     B̂_i = exp(ω_i) B_i,     ũ_i = û_i − R_Ã u_i
 
 with ã_i the error of the estimate ŷ_i = y_i° + â_i in the reference frame, c̃ that of the
 calibration, and on estimated axes: p of ε, k of a point, q of a turn. A point or tag that moves

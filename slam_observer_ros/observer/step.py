@@ -4,7 +4,7 @@ A motion along velocities without a gap, and an observation whose points are all
 landmarks, none of them in doubt. Anything else is UNUSUAL, and nothing is changed then: the
 filters' own methods go on from there.
 
-The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, see :mod:`.riccati.joint_covariance`.
+The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω: see :mod:`.chart`.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ class _Residuals(NamedTuple):
         return self.r[:, : self.axes.point].ravel()
 
     def output_matrix(self, chord: float) -> FloatArray:
-        """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, at ``chord`` from ŷ_i to the point seen."""
+        """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, ``chord`` of the way from ŷ_i to y."""
         C = self.axes.output_matrix(chord * self.r)
         C = C if self.D is None else np.concatenate([C, self.D], axis=2)
         return C.reshape(len(self.columns), -1)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from contextlib import suppress
 import os
+from pathlib import Path
 import re
 import signal
 import subprocess
 import sys
 from types import SimpleNamespace
 
+from demo_report import report
 from geometry_msgs.msg import Twist
 from node_processes import client
 import numpy as np
@@ -19,10 +21,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.nodes.demo.demo_report import report
 from slam_observer_ros.simulation import Scenario, Simulation
 
 pytestmark = pytest.mark.ros
+
+DEMO = Path(__file__).resolve().parents[2] / 'demo' / 'demo.py'
 
 FILES = {
     'configuration.png',
@@ -35,7 +38,7 @@ FILES = {
 
 def run_demo(folder, *options):
     """Return exit code and output of a demo; it and its nodes end, whatever happens."""
-    command = [sys.executable, '-m', 'slam_observer_ros.nodes.demo.demo', '--output', str(folder)]
+    command = [sys.executable, str(DEMO), '--output', str(folder)]
     with subprocess.Popen(
         [*command, *options],
         stdout=subprocess.PIPE,

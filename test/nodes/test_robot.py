@@ -5,13 +5,14 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
+import hall
+from hall_robot import Seen
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+import robot
+from robot_report import Interruption
 
-from slam_observer_ros.nodes.demo import hall, robot
-from slam_observer_ros.nodes.demo.hall_robot import Seen
-from slam_observer_ros.nodes.demo.robot_report import Interruption
 from slam_observer_ros.nodes.message_classes import TFMessage
 
 CHECKOUT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[2]
 PATHS = [
     str(CHECKOUT / name)
-    for name in ('slam_observer_ros', 'launch', 'scripts', 'test', 'benchmark', 'setup.py')
+    for name in ('slam_observer_ros', 'demo', 'launch', 'scripts', 'test', 'benchmark', 'setup.py')
     if (CHECKOUT / name).exists()
 ]
 

@@ -64,7 +64,7 @@ def tag_poses() -> FloatArray:
 
 
 def reflectors(random: np.random.Generator) -> FloatArray:
-    """Return the reflectors (n, 3) of a hall somewhere in which the lap is, metres."""
+    """Return points (n, 3) of a hall somewhere in which the lap is, metres."""
     low = random.uniform(-HALL_M + LAP_SPACE_M, -LAP_SPACE_M)
     return np.column_stack(
         [random.uniform(low, low + HALL_M, (REFLECTORS, 2)), np.zeros(REFLECTORS)]

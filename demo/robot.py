@@ -18,20 +18,20 @@ import tempfile
 import threading
 import time
 
+import hall
+from hall_robot import HallRobot, ODOMETRY_HZ
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 from rich.progress import Progress
+from robot_report import Interruption, report
 
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import write_map
-from slam_observer_ros.nodes.demo import hall
-from slam_observer_ros.nodes.demo.hall_robot import HallRobot, ODOMETRY_HZ
-from slam_observer_ros.nodes.demo.robot_report import Interruption, report
 from slam_observer_ros.nodes.launch_setup import command_line, EXECUTABLE
 from slam_observer_ros.nodes.stop_signal import StopSignal
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
+import hall
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.node import Node
@@ -18,7 +19,6 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.messages.poses import pose_matrices
-from slam_observer_ros.nodes.demo import hall
 from slam_observer_ros.nodes.message_classes import MESSAGES
 
 START_NS = 1_000_000_000  # a simulated /clock of zero means that there is no time yet

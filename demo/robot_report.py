@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from hall_robot import error_of, Estimated, HallRobot, Seen
 import numpy as np
 from rich.console import Console
 
 from slam_observer_ros.common.tables import table_of
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.nodes.demo.hall_robot import error_of, Estimated, HallRobot, Seen
 
 ENOUGH_TAGS, ENOUGH_REFLECTORS = 2, 6  # in view, by which the robot is found
 MAX_ERROR_M, MAX_ERROR_RAD = 0.15, 0.08  # of the RMS; with the noise of the hall it is a third

@@ -17,6 +17,8 @@ import sys
 import time
 from typing import TypeAlias
 
+from demo_listener import DemoListener
+from demo_report import report
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
@@ -24,8 +26,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.nodes.demo.demo_listener import DemoListener
-from slam_observer_ros.nodes.demo.demo_report import report
 from slam_observer_ros.nodes.stop_signal import StopSignal
 from slam_observer_ros.recording.writer import RecordingWriter
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from demo_listener import DemoListener
 import numpy as np
 from rich.console import Console
 
@@ -13,7 +14,6 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.metrics import Decay, fit_decay, trajectory_errors
 from slam_observer_ros.evaluation.plots.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.nodes.demo.demo_listener import DemoListener
 
 CHECKED_S = 60.0  # simulated time at which the observer must have converged
 CONVERGED_LOG10 = -10.0  # log10 L below which it has
