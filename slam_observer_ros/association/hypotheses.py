@@ -123,7 +123,11 @@ class Hypotheses:
 
         Hypotheses are moved on from ``start_ns``, and the most likely one may be wrong.
         """
-        of_each = [one.state.pose_after(velocities, start_ns, end_ns) for one in self._all]
+        of_each = [
+            usual.pose_after(one.state, velocities, start_ns, end_ns)
+            or one.state.pose_after(velocities, start_ns, end_ns)
+            for one in self._all
+        ]
         return of_each[0][0], self._mixed(of_each)
 
     def poses_until(

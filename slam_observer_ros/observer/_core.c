@@ -811,8 +811,10 @@ static int advance(const Estimate *x, const Velocities *v, const Interval *inter
     i64 start_ns = interval->start_ns - interval->delay_ns;
     i64 end_ns = interval->end_ns - interval->delay_ns;
     long first = rows_up_to(v->stamps_ns, v->count, start_ns, 1) - 1;
-    long last = rows_up_to(v->stamps_ns, v->count, end_ns, 0), k = last - first;
-    if (first < 0 || k < 1 || k > MAX_PIECES)
+    long last = rows_up_to(v->stamps_ns, v->count, end_ns, 0);
+    last = last > first ? last : first + 1; /* between the same stamps: a piece without time */
+    long k = last - first;
+    if (first < 0 || end_ns < start_ns || k > MAX_PIECES)
         return UNUSUAL;
     double at_start[6], at_end[6], ad_first[36], ad_last[36];
     if (interval->reach_ns) {

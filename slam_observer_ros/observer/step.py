@@ -113,9 +113,9 @@ def _pieces(
     """
     start_ns, end_ns = interval.start_ns - interval.delay_ns, interval.end_ns - interval.delay_ns
     first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
-    last = int(velocities.stamps_ns.searchsorted(end_ns, 'left'))
+    last = max(int(velocities.stamps_ns.searchsorted(end_ns, 'left')), first + 1)
     bounds_ns = np.append(velocities.stamps_ns[first:last], end_ns)
-    if last <= first or velocities.is_stated[first:last].any():
+    if end_ns < start_ns or first < 0 or velocities.is_stated[first:last].any():
         return None
     bounds_ns[0], since_ns = start_ns, velocities.since_ns[first:last]
     if (since_ns[:, 1] + velocities.timeout_ns < bounds_ns[1:]).any():

@@ -27,11 +27,12 @@ from slam_observer_ros.observer.flat_arrays import (
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.riccati import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
-from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.state.covariances import of_pose
 from slam_observer_ros.state.state import State
 
-_NO_ENTRIES, _NO_IDS = np.empty(0), np.empty(0, dtype=np.int64)
+_NO_ENTRIES, _NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,20 +53,10 @@ def advance(
     x = _estimate(state)
     if x is None:
         return None
-    filter_, calibration, p = state.filter, state.filter.calibration, state.axes.p
-    reach_ns = calibration.delay_error_ns
-    interval = Interval(start_ns, end_ns, calibration.delay_ns, reach_ns, state._end_velocity)
-    out = Advanced(
-        np.empty((4, 4)),
-        np.empty((p, p)),
-        np.empty((p, p)),
-        np.empty((p, calibration.count)),
-        np.empty(6),
-        np.empty(6),
-    )
-    status = core.advance(x, velocities.flat(), interval, filter_.motion_noise.figures, out)
+    status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
+    calibration = state.filter.calibration
     if state.relinearisation is not None and state.relinearisation.is_active:
         history = state.relinearisation.history
         history.begin(x.A)
@@ -73,11 +64,28 @@ def advance(
         history.move_on(out.A, out.noise, out.sensitivity, drift, calibration)
     of_driving = out.noise - out.of_turning
     is_rest = status == step.AT_REST
-    filter_.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
+    state.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
     x.A[...] = out.A
-    if reach_ns:
+    if calibration.delay_error_ns:
         state._end_velocity = out.at_end
     return out.variances
+
+
+def pose_after(
+    state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
+) -> tuple[FloatArray, FloatArray | None] | None:
+    """As :meth:`.State.pose_after`: what :func:`advance` would lead to, of pose and c̃ alone."""
+    joint, observer, axes = state.filter.joint, state.observer, state.axes
+    if joint is None:
+        return None
+    P = joint.P[: joint.first, : joint.first].copy()
+    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, joint.first, joint.first)
+    status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
+    if status == step.UNUSUAL:
+        return None
+    covariance = axes.full_pose_covariance(P[: axes.p, : axes.p])
+    world = of_pose(observer, covariance, out.A)
+    return observer.reference_pose.dot(out.A), world
 
 
 def observe(state: State, event: ObservationEvent) -> Outcome | None:
@@ -133,23 +141,56 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
 
 def _estimate(state: State) -> Estimate | None:
     """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
-    joint, observer, calibration = state.filter.joint, state.observer, state.filter.calibration
+    joint, observer = state.filter.joint, state.observer
     if type(joint) is not JointCovariance or joint.chart.stride > state.axes.point:
         return None
     if observer.have_moved:
         return None
+    matrix = joint._matrix
+    return _estimate_of(
+        state, observer.y_ref, observer.a, matrix._storage, matrix._size, joint.first
+    )
+
+
+def _estimate_of(
+    state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, size: int, first: int
+) -> Estimate:
+    calibration = state.filter.calibration
     return Estimate(
-        observer.A,
-        observer.y_ref,
-        observer.a,
-        joint._matrix._storage,
-        joint._matrix._size,
-        joint.first,
+        state.observer.A,
+        y_ref,
+        a,
+        P,
+        size,
+        first,
         state.settings.two_d_mode,
         calibration._all,
         calibration._estimated,
         calibration.drift_covariance,
     )
+
+
+def _advanced(
+    state: State, x: Estimate, velocities: Velocities, start_ns: int, end_ns: int
+) -> tuple[int, Advanced]:
+    """Move ``x`` on along velocities (27); return whether that was usual, and what it did."""
+    calibration, p = state.filter.calibration, state.axes.p
+    interval = Interval(
+        start_ns,
+        end_ns,
+        calibration.delay_ns,
+        calibration.delay_error_ns,
+        state._end_velocity,
+    )
+    out = Advanced(
+        np.empty((4, 4)),
+        np.empty((p, p)),
+        np.empty((p, p)),
+        np.empty((p, calibration.count)),
+        np.empty(6),
+        np.empty(6),
+    )
+    return core.advance(x, velocities, interval, state.motion_noise.figures, out), out
 
 
 def _seen(state: State, event: ObservationEvent) -> Seen | None:

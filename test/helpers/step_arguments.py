@@ -50,7 +50,7 @@ def random_estimate(rng, n=None):
 
 def random_motion(rng):
     """Return arguments of ``advance``."""
-    x = random_estimate(rng)
+    x = random_estimate(rng, None if rng.random() < 0.9 else 0)
     r = int(rng.integers(2, 30))
     steps_ns = rng.integers(1_000_000, 100_000_000, r)
     stamps_ns = START_NS + np.cumsum(steps_ns)
@@ -61,7 +61,7 @@ def random_motion(rng):
     usual_s = tuple(rng.choice([0.02, 0.1, np.inf], 2).tolist())
     velocities = Velocities(stamps_ns, V, since_ns, is_stated, *usual_s, SECOND_NS)
     begin_ns = int(rng.integers(stamps_ns[1], stamps_ns[-1] + 1))
-    end_ns = begin_ns + int(rng.integers(1, 500_000_000))
+    end_ns = begin_ns + int(rng.integers(1, 500_000_000)) * int(rng.random() < 0.9)
     delay_ns = int(rng.integers(-50_000_000, 50_000_000))
     at_start = rng.standard_normal(6) if rng.integers(2) else None
     reach_ns = int(rng.choice([0, 200_000_000]))

@@ -82,8 +82,10 @@ class BothWays:
     """Lets hypotheses take each step through both, and counts the usual ones."""
 
     def __init__(self, monkeypatch):
-        self.usual = self.observed = self.moved = 0
+        self.usual = self.observed = self.moved = self.asked = self.answered = 0
         self._advance, self._observe = usual.advance, usual.observe
+        self._pose_after = usual.pose_after
+        monkeypatch.setattr(usual, 'pose_after', self.pose_after)
         monkeypatch.setattr(usual, 'advance', self.advance)
         monkeypatch.setattr(usual, 'observe', self.observe)
 
@@ -99,6 +101,19 @@ class BothWays:
         np.testing.assert_allclose(variances, np.diagonal(motion.covariances.sum(axis=0)))
         self.moved += 1
         return variances
+
+    def pose_after(self, state, velocities, start_ns, end_ns):
+        other = state.copy()
+        self.asked += 1
+        found = self._pose_after(state, velocities, start_ns, end_ns)
+        assert_same(state, other, f'the question for the pose at {end_ns}')
+        if found is not None:
+            self.answered += 1
+            pose, covariance = other.pose_after(velocities, start_ns, end_ns)
+            np.testing.assert_allclose(found[0], pose, rtol=0, atol=1e-12 * np.abs(pose).max())
+            size = np.abs(covariance).max()
+            np.testing.assert_allclose(found[1], covariance, rtol=0, atol=1e-12 * size)
+        return found
 
     def observe(self, state, event):
         other = state.copy()
@@ -130,10 +145,12 @@ def test_a_usual_step_is_the_general_one_to_rounding(worlds, monkeypatch, name):
     estimator = Estimator(settings, judges_innovations=True)
     for event in world.events:
         estimator.add(event)
+        assert estimator.pose_covariance.shape == (6, 6)
         if isinstance(event, ObservationEvent) and both.observed >= OBSERVATIONS:
             break
     assert both.usual >= USUAL_SHARE * both.observed
     assert both.moved >= USUAL_SHARE * both.observed
+    assert both.answered >= USUAL_SHARE * both.asked
 
 
 def test_points_of_any_precision_and_order_are_taken(worlds):
