@@ -4,9 +4,9 @@ P is that of pose, calibration and the landmarks that are *active*: near, or see
 and observations change P alone, and what they yet have to do to all others is postponed
 (:mod:`.postponed_correction`) until other landmarks become active. It is exact but for one thing:
 what the noise of a motion does to the error ξ_i of a landmark out of view is judged by a reference
-position, which is set again when the estimate is ``REFERENCE_SHIFT_M`` off (J. Guivant and
-E. Nebot, *Optimization of the SLAM algorithm for real-time implementation*, 2001). As long as
-there are few landmarks all are active.
+position, which is set again when the estimate is too far off (J. Guivant and E. Nebot,
+*Optimization of the SLAM algorithm for real-time implementation*, 2001). As long as there are few
+landmarks all are active. How the others follow: :mod:`.following_landmarks`.
 """
 
 from __future__ import annotations
@@ -19,17 +19,13 @@ import numpy as np
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose
 from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
-from slam_observer_ros.observer.riccati.outside_landmarks import (
-    Change,
-    Moved,
-    OutsideLandmarks,
-    View,
-)
+from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.motion import Motion
@@ -37,17 +33,8 @@ from slam_observer_ros.sensor_models.motion import Motion
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-REFERENCE_SHIFT_M = 0.1
-"""How far estimates of landmarks out of view may be from their references."""
-
 CHECK_INTERVAL = 20
-"""Corrections in which that is looked at, of each landmark once."""
-
-CHANGE_INTERVAL = 64
-"""Corrections in which a change comes to all landmarks, if no other one has to begin before."""
-
-FOLDING = 3e7
-"""Multiplications by which postponed corrections are worked off at each correction, at least."""
+"""Corrections in which each landmark is looked at once, whether it is near its reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,26 +60,29 @@ class CompressedCovariance(JointCovariance):
         n = len(observer.y_ref)
         self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
         self._set_active(np.arange(n), n)
-        self._outside = OutsideLandmarks(self.chart, len(self.P))
-        # (n,) where each landmark is outside, −1 for nowhere; and (slots,) which ones are there
-        self._slots = np.full(n, -1)
-        self._in_slots: IntArray = np.empty(0, dtype=np.int64)
-        self._postponed = self._nothing_postponed()
+        self._following = FollowingLandmarks(self.chart, observer, self.P)
         self._corrections, self._most = 0, size.most
-        self._changed = 0  # panels, since the last correction
 
     def copy(self, observer: Observer) -> Self:
         """Return an independent copy, which shares what takes much memory until it changes."""
         other = super().copy(observer)
         other._observer = observer
-        other._outside, other._postponed = self._outside.copy(), self._postponed.copy()
+        other._following = self._following.copy(observer)
         return other
+
+    @property
+    def _postponed(self) -> PostponedCorrection:
+        return self._following.postponed
+
+    @property
+    def _outside(self) -> OutsideLandmarks:
+        return self._following.outside
 
     @property
     def references(self) -> FloatArray:
         """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
         points = self._observer.points
-        for view in self._views(self._others):
+        for view in self._following.views(self._others):
             points[view.rows] = view.references
         return points
 
@@ -120,7 +110,7 @@ class CompressedCovariance(JointCovariance):
         Kr: FloatArray = W.T @ z[:, 0]
         turn = self._axes.full_pose(-Kr[: self._p])[:3]
         self._postponed.correct(W, W_Phi, z[:, 0], turn)
-        self._work()
+        self._following.work()
         return Kr
 
     def activate(self, rows: IntArray) -> None:
@@ -132,21 +122,9 @@ class CompressedCovariance(JointCovariance):
         self._corrections += 1
         if not self._outside.unchanged:
             first = self._corrections % CHECK_INTERVAL
-            self._check(range(first, len(self._outside.panels), CHECK_INTERVAL))
-
-    def _check(self, numbers: range) -> None:
-        """Set all references again if one in these panels is too far off."""
-        for number in numbers:
-            rows, are_out = self._in_panel(number)
-            X = self._outside.complete(number, are_out)
-            off = self._points(rows) - self._outside.panels[number].references
-            off += self._shifts(off, X)
-            if np.linalg.norm(off[are_out], axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
+            some = range(first, len(self._outside.panels), CHECK_INTERVAL)
+            if not self._following.are_near(some):
                 self._restart(self.active[:0])
-                return
-            self._turn(number, X)
-        if self.chart.turn:
-            self._forget_gains()
 
     def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
         """Return what â_i (m, 3) of landmarks are with all that is postponed."""
@@ -156,7 +134,7 @@ class CompressedCovariance(JointCovariance):
         """Return how far the observer has yet to move landmarks (m, 3), metres."""
         # Not done here: those who look at the map must not change the bits of the estimate.
         shifts = np.zeros((len(self._places), 3))
-        for view in self._views(rows[self._places[rows] < 0]):
+        for view in self._following.views(rows[self._places[rows] < 0]):
             shifts[view.rows] = view.shifts
         chosen: FloatArray = shifts[rows]
         return chosen
@@ -213,7 +191,7 @@ class CompressedCovariance(JointCovariance):
         m = len(points)
         slots = self._outside.add_independent(points, self._known_blocks(covariances))
         self._places = np.concatenate([self._places, np.full(m, -1)])
-        self._set_slots(np.concatenate([self._slots, slots]))
+        self._following.set_slots(np.concatenate([self._following.slots, slots]), self._others)
 
     def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
         """Take over orientations (m,) whose errors (m, q, q) are independent of all else."""
@@ -221,20 +199,17 @@ class CompressedCovariance(JointCovariance):
         super().add_known_turns(rows[is_active], covariances[is_active])
         if not is_active.all():
             self._apply()
-            slots = self._slots[rows[~is_active]]
+            following = self._following
+            slots = following.slots[rows[~is_active]]
             order, turns = np.argsort(slots), slice(self._axes.point, self._stride)
-            self._outside.set_independent(slots[order], turns, covariances[~is_active][order])
+            following.outside.set_independent(slots[order], turns, covariances[~is_active][order])
 
     def own_turns(self, rows: IntArray) -> FloatArray:
         """Return the covariances (m, q, q) of each ω_i, rad²."""
         is_active, q = self._places[rows] >= 0, self.chart.turn
-        covariances, at = np.empty((len(rows), q, q)), np.flatnonzero(~is_active)
+        covariances = np.empty((len(rows), q, q))
         covariances[is_active] = super().own_turns(rows[is_active])
-        at, k, begin = at[np.argsort(self._slots[rows[at]])], self._axes.point, 0
-        for view in self._views(rows[at]):
-            X, mine = view.X[:, k:], at[begin : begin + len(view.rows)]
-            own = view.own[:, k:, k:] - (X @ self._postponed.Psi) @ transpose(X)
-            covariances[mine], begin = own, begin + len(view.rows)
+        covariances[~is_active] = self._following.own_turns(rows[~is_active])
         return covariances
 
     def of_landmarks(
@@ -248,15 +223,15 @@ class CompressedCovariance(JointCovariance):
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
         """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
         every = np.tile(np.eye(3), (len(self._places), 1, 1))
-        for view in self._views(np.unique(rows[self._places[rows] < 0])):
+        for view in self._following.views(np.unique(rows[self._places[rows] < 0])):
             every[view.rows] = view.turns
         turned: FloatArray = every[rows] @ B
         return turned
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
-        self._finish()
-        places, slots = self._places[rows], self._slots[rows]
+        self._following.finish()
+        places, slots = self._places[rows], self._following.slots[rows]
         columns = self.chart.of_landmarks(places[places >= 0])
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
         self._postponed.remove(columns)
@@ -265,7 +240,7 @@ class CompressedCovariance(JointCovariance):
         kept[rows] = False
         number = np.cumsum(kept) - 1
         self._set_active(number[self.active[kept[self.active]]], int(kept.sum()))
-        self._set_slots(self._slots[kept])
+        self._following.set_slots(self._following.slots[kept], self._others)
 
     # All of it
 
@@ -292,23 +267,22 @@ class CompressedCovariance(JointCovariance):
         P[:p] = P[:, :p] = 0.0
         P[:p, :p] = covariance
         self.P = sheared(P, self.first, T)
-        self._postponed = self._nothing_postponed()
+        self._following.start(self.P)
 
     def marginal(self, rows: IntArray) -> JointCovariance:
         """Return the covariance of pose, calibration and different landmarks (m,) alone."""
         is_active = self._places[rows] >= 0
         others = np.flatnonzero(~is_active)
-        others = others[np.argsort(self._slots[rows[others]])]
+        others = others[np.argsort(self._following.slots[rows[others]])]
         local = np.append(
             np.arange(self.first), self.chart.of_landmarks(self._places[rows[is_active]])
         )
-        postponed, outside, views = self._postponed, self._outside, self._views(rows[others])
-        Phi, b = postponed.Phi[local], postponed.Phi.shape[1]
-        X = np.concatenate([np.empty((0, b)), *(view.X.reshape(-1, b) for view in views)])
-        own = outside.among(self._slots[rows[others]], views) - X @ postponed.Psi @ X.T
-        to_local = X @ Phi.T
+        following, postponed = self._following, self._postponed
+        views = following.views(rows[others])
+        X, B, references = following.joined(rows[others], views)
+        own = B - X @ postponed.Psi @ X.T
+        to_local = X @ postponed.Phi[local].T
         P = np.block([[self.P[np.ix_(local, local)], to_local.T], [to_local, own]])
-        references = np.concatenate([np.empty((0, 3)), *(view.references for view in views)])
         # From η to ξ, and in the order of the rows.
         P = sheared(P, len(local), self._all_turning(references))
         order = np.argsort(np.append(np.flatnonzero(is_active), others))
@@ -345,106 +319,13 @@ class CompressedCovariance(JointCovariance):
     def _apply(self) -> None:
         """Do what is postponed; refer to present estimates."""
         self._restart(self.active[:0])
-        self._finish()
-
-    def _work(self) -> None:
-        """Do some of what is left to be done to landmarks outside."""
-        outside = self._outside
-        share = -(-len(outside.panels) // CHANGE_INTERVAL)
-        for number in list(outside.unchanged)[: max(share - self._changed, 0)]:
-            self._change(number)
-        self._changed = 0
-        outside.matrix.fold(FOLDING)
-
-    def _finish(self) -> None:
-        """Do all of it that is not only folding."""
-        for number in list(self._outside.unchanged):
-            self._change(number)
-
-    def _change(self, number: int) -> None:
-        """Do what is left to be done to the landmarks of a panel."""
-        rows, are_out = self._in_panel(number)
-        moved = self._moved(number, rows, are_out)
-        self._observer.a[rows[are_out]] += moved.shifts[are_out]
-        if self.chart.turn:
-            self._observer.orientations.turn(rows[are_out], moved.turns[are_out])
-        self._outside.make(number, moved)
-        self._changed += 1
-
-    def _moved(self, number: int, rows: IntArray, are_out: BoolArray) -> Moved:
-        return self._outside.moved(number, self._points(rows), are_out)
-
-    def _points(self, rows: IntArray) -> FloatArray:
-        """Return where the observer has landmarks (m, 3) for now, metres."""
-        points: FloatArray = self._observer.y_ref[rows] + self._observer.a[rows]
-        return points
-
-    def _in_panel(self, number: int) -> tuple[IntArray, BoolArray]:
-        """Return landmarks (slots,) of a panel, and which of them are there; others are any."""
-        each = self._outside.slots_each
-        rows = self._in_slots[each * number : each * (number + 1)]
-        return rows, rows >= 0
-
-    def _views(self, rows: IntArray) -> list[View]:
-        """Return what landmarks (m,) out of view are now, panel by panel in ascending order."""
-        views, outside, k = [], self._outside, self._axes.point
-        for number, local in outside.by_panel(self._slots[rows]):
-            in_panel, are_out = self._in_panel(number)
-            moved = None
-            panel, shifts = outside.panels[number], np.zeros((len(in_panel), 3))
-            if number in outside.unchanged:
-                moved = self._moved(number, in_panel, are_out)
-                panel, shifts = moved.panel, moved.shifts
-            X = outside.completed(number, are_out, moved)
-            shifts = shifts + self._shifts(self._points(in_panel) + shifts - panel.references, X)
-            at, blocks = np.sort(local), X.reshape(len(in_panel), self._stride, -1)
-            turns = self._postponed.turns(blocks[at, k:], panel.turned, self._axes)
-            turns = turns if moved is None else turns @ moved.turns[at]
-            views.append(
-                View(
-                    in_panel[at],
-                    blocks[at],
-                    panel.own[at],
-                    panel.references[at],
-                    shifts[at],
-                    turns,
-                    moved,
-                )
-            )
-        return views
-
-    def _turn(self, number: int, X: FloatArray) -> None:
-        """Turn the tags of a panel."""
-        if not self.chart.turn:
-            return
-        rows, are_out = self._in_panel(number)
-        panel, each = self._outside.panels[number], X.reshape(len(rows), self._stride, -1)
-        turns = self._postponed.turns(each[:, self._axes.point :], panel.turned, self._axes)
-        self._observer.orientations.turn(rows[are_out], turns[are_out])
-        panel.turned = len(self._postponed.gains or [])
-
-    def _forget_gains(self) -> None:
-        """Forget those by which all tags have been turned."""
-        panels, gains = self._outside.panels, self._postponed.gains
-        done = min((panel.turned for panel in panels), default=0)
-        if gains is not None and done:
-            del gains[:done]
-            for panel in panels:
-                panel.turned -= done
-
-    def _shifts(self, off: FloatArray, X: FloatArray) -> FloatArray:
-        """Return how far landmarks of a panel, ``off`` (slots, 3) their references, move."""
-        shifts = np.zeros_like(off)
-        if self._postponed.has_moved:
-            k, X = self._axes.point, X.reshape(len(off), self._stride, -1)
-            shifts[:, :k] = self._postponed.shifted(off[:, :k], X[:, :k]) - off[:, :k]
-        return shifts
+        self._following.finish()
 
     def _restart(self, released: IntArray) -> None:
         """Let x start again, without landmarks (m,), and all else be changed little by little."""
-        self._finish()
+        self._following.finish()
         outside, P, p, angles = self._outside, self.P, self._p, self._p - self._axes.point
-        all_slots = self._slots.copy()
+        all_slots = self._following.slots.copy()
         new = released[all_slots[released] < 0]
         all_slots[new] = outside.new_slots(len(new))
         released = released[np.argsort(all_slots[released])]
@@ -473,56 +354,38 @@ class CompressedCovariance(JointCovariance):
         outside.begin(change)
         self.P = P[np.ix_(kept, kept)]
         self._set_active(self.active[~np.isin(self.active, released)], len(self._places))
-        self._set_slots(all_slots)
-        self._postponed = self._nothing_postponed()
+        self._following.set_slots(all_slots, self._others)
+        self._following.start(self.P)
 
     def _take_in(self, rows: IntArray) -> None:
         """Make landmarks (m,) active, too."""
         if not len(rows):
             return
-        outside, P, p, postponed = self._outside, self.P, self._p, self._postponed
-        for number, _ in outside.by_panel(self._slots[rows]):
-            if number in outside.unchanged:
-                self._change(number)
-            outside.complete(number, self._in_panel(number)[1])
-        rows = rows[np.argsort(self._slots[rows])]
-        slots, views = self._slots[rows], self._views(rows)
-        X = np.concatenate([view.X for view in views]).reshape(len(rows) * self._stride, -1)
-        self._observer.a[rows] += np.concatenate([view.shifts for view in views])
-        if self.chart.turn:
-            self._observer.orientations.turn(rows, np.concatenate([view.turns for view in views]))
-        among, XPsi = outside.among(slots, views), X @ postponed.Psi
+        following, postponed, P, p = self._following, self._postponed, self.P, self._p
+        rows = rows[np.argsort(following.slots[rows])]
+        X, among, references = following.catch_up(rows)
+        XPsi = X @ postponed.Psi
         # ξ = η + T ε with x and with each other.
-        T = self._all_turning(np.concatenate([view.references for view in views]))
+        T = self._all_turning(references)
         eta_to_x = X @ postponed.Phi.T
         to_x = eta_to_x + T @ P[:p]
         own = among - XPsi @ X.T + eta_to_x[:, :p] @ T.T + T @ to_x[:, :p].T
         postponed.take(T @ postponed.Phi[:p] - XPsi, np.diagonal(among))
         self.P = np.block([[P, to_x.T], [to_x, symmetric(own)]])
         self._set_active(np.append(self.active, rows), len(self._places))
-        self._set_slots(self._slots)
-        outside.clear(slots)
-        outside.taken = np.append(outside.taken, slots)
+        following.set_slots(following.slots, self._others)
+        following.outside.take(following.slots[rows])
 
     def _set_active(self, rows: IntArray, n: int) -> None:
         self.active, self._places = rows, np.full(n, -1)
         self._places[rows] = np.arange(len(rows))
 
-    def _set_slots(self, slots: IntArray) -> None:
-        self._slots, outside = slots, self._others
-        self._in_slots = np.full(self._outside.slots_each * len(self._outside.panels), -1)
-        self._in_slots[slots[outside]] = outside
-
     def _of_others(self, rows: IntArray, q: int) -> tuple[FloatArray, FloatArray]:
         """Return covariances with q first entries of x (m, k, q), own (m, k, k) of ξ_i outside."""
-        order = np.argsort(np.argsort(self._slots[rows]))
-        k, p, postponed, views = self._axes.point, self._p, self._postponed, self._views(rows)
-        X = np.concatenate([view.X for view in views])[order, :k]
-        T = self._turning(np.concatenate([view.references for view in views])[order])
-        own = np.concatenate([view.own for view in views])[order, :k, :k]
-        to_state = X @ postponed.Phi[:q].T
+        X, own, references = self._following.each(rows)
+        T, p = self._turning(references), self._p
+        to_state = X @ self._postponed.Phi[:q].T
         turned = T @ transpose(to_state[:, :, :p])
-        own = own - (X @ postponed.Psi) @ transpose(X)
         own = own + turned + transpose(turned) + T @ self.pose @ transpose(T)
         return to_state + T @ self.P[:p, :q], own
 
@@ -535,7 +398,7 @@ class CompressedCovariance(JointCovariance):
         super()._make_room(m)
         new = len(self._places) + np.arange(m)
         self._set_active(np.append(self.active, new), len(self._places) + m)
-        self._slots = np.append(self._slots, np.full(m, -1))
+        self._following.slots = np.append(self._following.slots, np.full(m, -1))
         self._postponed.extend(self._stride * m)
         return new
 
@@ -545,9 +408,6 @@ class CompressedCovariance(JointCovariance):
         blocks[:, :k, :k] = covariances[:, :k, :k]
         blocks[:, np.arange(k, self._stride), np.arange(k, self._stride)] = self._unknown
         return blocks
-
-    def _nothing_postponed(self) -> PostponedCorrection:
-        return PostponedCorrection(self.P, self._axes.point, self.chart.turn > 0)
 
     def _columns(self, rows: IntArray) -> IntArray:
         return super()._columns(self._places[rows])

@@ -142,6 +142,11 @@ class OutsideLandmarks:
             X[self.rows(local)] = 0.0
             self.panels[number].X = X
 
+    def take(self, slots: IntArray) -> None:
+        """Let landmarks be in x from now on."""
+        self.clear(slots)
+        self.taken = np.append(self.taken, slots)
+
     def by_panel(self, slots: IntArray) -> list[tuple[int, IntArray]]:
         """Return panels, and which of their slots are among these."""
         numbers = slots // self.slots_each
