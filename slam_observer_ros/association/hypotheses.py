@@ -144,7 +144,11 @@ class Hypotheses:
         if not with_covariances:
             passage = self.best.passage(velocities, start_ns, stamps_ns, with_covariances)
             return self.best.observer.reference_pose @ passage.poses, None
-        of_each = [one.state.poses_until(velocities, start_ns, stamps_ns) for one in self._all]
+        of_each = [
+            usual.poses_until(one.state, velocities, start_ns, stamps_ns)
+            or one.state.poses_until(velocities, start_ns, stamps_ns)
+            for one in self._all
+        ]
         return of_each[0][0], self._mixed(of_each)
 
     def _mixed(self, of_each: Sequence[tuple[FloatArray, FloatArray | None]]) -> FloatArray | None:

@@ -211,6 +211,24 @@ class VelocityHistory:
             self._timeout_ns,
         )
 
+    def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
+        """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
+        known = self.flat()
+        counts = known.stamps_ns.searchsorted(stamps_ns, 'right')
+        usual_s = self._joined.usual_s[counts - 1].tolist()
+        return [
+            Velocities(
+                known.stamps_ns[:count],
+                known.body_velocities[:count],
+                known.since_ns[:count],
+                known.is_stated[:count],
+                angular_s,
+                linear_s,
+                self._timeout_ns,
+            )
+            for count, (angular_s, linear_s) in zip(counts.tolist(), usual_s, strict=True)
+        ]
+
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
         pieces = self._pieces(start_ns, end_ns)

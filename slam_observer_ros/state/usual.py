@@ -74,18 +74,46 @@ def advance(
 def pose_after(
     state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
 ) -> tuple[FloatArray, FloatArray | None] | None:
-    """As :meth:`.State.pose_after`: what :func:`advance` would lead to, of pose and c̃ alone."""
-    joint, observer, axes = state.filter.joint, state.observer, state.axes
-    if joint is None:
+    """As :meth:`.State.pose_after`."""
+    found = _led_to(state, velocities.flat(), start_ns, end_ns)
+    return None if found is None else _in_world(state, *found)
+
+
+def poses_until(
+    state: State, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
+) -> tuple[FloatArray, FloatArray | None] | None:
+    """As :meth:`.State.poses_until`."""
+    poses, covariances = np.empty((len(stamps_ns), 4, 4)), np.empty((len(stamps_ns), 6, 6))
+    known_then = velocities.flat_then(stamps_ns)
+    for row, (known, stamp_ns) in enumerate(zip(known_then, stamps_ns.tolist(), strict=True)):
+        found = _led_to(state, known, start_ns, stamp_ns)
+        if found is None:
+            return None
+        poses[row], covariances[row] = found
+    return _in_world(state, poses, covariances)
+
+
+def _led_to(
+    state: State, velocities: Velocities, start_ns: int, end_ns: int
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return Â and the covariance (6, 6) of ε to which :func:`advance` would lead."""
+    joint, axes = state.filter.joint, state.axes
+    if joint is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
+    # Landmarks have no part in it.
     P = joint.P[: joint.first, : joint.first].copy()
     x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, joint.first, joint.first)
-    status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
+    status, out = _advanced(state, x, velocities, start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    covariance = axes.full_pose_covariance(P[: axes.p, : axes.p])
-    world = of_pose(observer, covariance, out.A)
-    return observer.reference_pose.dot(out.A), world
+    return out.A, axes.full_pose_covariance(P[: axes.p, : axes.p])
+
+
+def _in_world(
+    state: State, A: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray | None]:
+    observer = state.observer
+    return observer.reference_pose @ A, of_pose(observer, covariance, A)
 
 
 def observe(state: State, event: ObservationEvent) -> Outcome | None:
