@@ -15,7 +15,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
-from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
@@ -26,6 +25,7 @@ from slam_observer_ros.association.joint_compatibility import (
     Pairs,
     PRUNING_COST,
 )
+from slam_observer_ros.association.landmark_index import LandmarkIndex
 from slam_observer_ros.association.new_landmarks import NewLandmarks
 from slam_observer_ros.association.visibility import FieldOfView, Visibility
 from slam_observer_ros.estimator.estimator import Estimator
