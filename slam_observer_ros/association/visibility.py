@@ -115,10 +115,10 @@ class Visibility:
         cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
         self.missed = self._missed(in_view & ~landmarks.tentative, seen)
         landmarks.note_in_view(rows, seen[rows], self._has_moved(state))
-        if not some_have_ids:  # those that a loaded map has by an id
+        if not some_have_ids:  # landmarks of a loaded map, by their ids
             landmarks.note_missed(np.flatnonzero(~is_numbered & in_view), seen)
         self._field_of_view.include(event.points)
-        # Those that were seen too seldom, and those that were confirmed.
+        # Landmarks seen too seldom, and landmarks that were confirmed.
         were_tentative = np.count_nonzero(landmarks.tentative)
         unsupported = landmarks.unsupported(state.settings.min_support)
         self.confirmed_now = int(were_tentative - np.count_nonzero(landmarks.tentative))

@@ -467,7 +467,7 @@ class Estimator:
 
     @property
     def calibration(self) -> list[CalibrationEstimate]:
-        """Scale, bias and delay of the velocity, those that the settings ask for."""
+        """Scale, bias and delay of the velocity, as far as the settings ask for them."""
         return self._hypotheses.calibration
 
     @property
