@@ -58,11 +58,15 @@ class RangeErrors:
         if event is None:
             return
         self._waiting.remove(event)
-        used = np.intersect1d(update.ids, known)
-        _, seen, rows = np.intersect1d(event.ids, used, return_indices=True)
-        if not len(rows):
+        if not len(known):
             return
-        at = np.argsort(known)[np.searchsorted(np.sort(known), used[rows])]
+        seen, by_id = np.argsort(event.ids), np.argsort(known)
+        ids = event.ids[seen]
+        at = by_id.take(known[by_id].searchsorted(ids), mode='clip')
+        is_used = (known[at] == ids) & np.isin(ids, update.ids)
+        if not np.count_nonzero(is_used):
+            return
+        seen, at = seen[is_used], at[is_used]
         points = se3.transform(se3.inverse(update.pose), world_points[at])
         shown = event.lines_of_sight[seen]
         arms = points - (event.points - event.lines_of_sight)[seen]

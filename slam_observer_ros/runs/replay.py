@@ -267,7 +267,7 @@ class _RunningReplay:
         known, world_points = self._estimator.landmark_ids, self._estimator.world_points
         self._ranges.note_update(update, known, world_points)
         self._count_observation()
-        self._compare_with_truth(update)
+        self._compare_with_truth(update, known, world_points)
 
     def _on_jump(self) -> None:
         self._next_nees_ns = 0
@@ -281,11 +281,10 @@ class _RunningReplay:
         self._observations += used > self._used_points
         self._used_points = used
 
-    def _compare_with_truth(self, update: Update) -> None:
+    def _compare_with_truth(self, update: Update, ids: IntArray, points: FloatArray) -> None:
         """Keep what is compared with the truth; compare it now if a covariance may be due."""
         if self._pose_truth is None or self._landmark_tracks is None:
             return
-        ids, points = self._estimator.landmark_ids, self._estimator.world_points
         self._uncompared.append((update, ids, points))
         has_errors = len(ids) > 0 and not self._in_fixed_map
         is_nees_due = has_errors and update.stamp_ns >= self._next_nees_ns
