@@ -1,8 +1,8 @@
 """Which landmarks the points of an observation are, where the sensor gave no ids.
 
 An *assignment* takes each such point for a landmark, or for a new one. What matters is where it
-puts the robot: of those that agree on that, within the sensor's noise, the most likely one is
-taken. Those that disagree are all returned, for later observations to decide
+puts the robot: among assignments that agree on that, within the sensor's noise, the most likely
+one is taken. Assignments that disagree are all returned, for later observations to decide
 (:mod:`slam_observer_ros.association.hypotheses`).
 
 A point with a new id may be of a landmark that had none so far, but only where the state predicts

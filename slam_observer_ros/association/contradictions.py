@@ -1,10 +1,10 @@
-"""A pose that is wrong, shown by different landmarks that are rejected one after another.
+"""Whether the pose is wrong, as observation after observation contradicts it.
 
-One landmark that is rejected may have moved, and one observation may be garbled. But where all
-landmarks of an observation are rejected, and others were before, and one motion of the robot puts
-all of them where they are, it is the pose that is wrong: odometry has drifted or slipped by more
-than its stated noise. Filters with a joint covariance weigh that as hypotheses; for the others it
-is decided here.
+A rejected landmark may have moved, and a rejected observation may be garbled. The pose is wrong if
+three things come together: all landmarks of an observation are rejected, other landmarks were
+rejected before, and a single motion of the robot explains all of them. Odometry has then drifted
+or slipped by more than its stated noise. Filters with a joint covariance weigh this as hypotheses;
+for all other filters it is decided here.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class _Rejected:
 
 
 class Contradictions:
-    """Landmarks rejected since the last observation of which one was not, by id."""
+    """The landmarks that were rejected since a landmark last passed the gate, by id."""
 
     def __init__(self) -> None:
         self._rejected: dict[int, _Rejected] = {}
@@ -42,9 +42,9 @@ class Contradictions:
         self._rejected.clear()
 
     def resolve(self, state: State, matched: MatchedObservation) -> bool:
-        """Let the robot have strayed if that explains all rejections; return whether it has.
+        """Let the robot have slipped if that explains all rejections; return whether it does.
 
-        The observation is then to be matched again.
+        The observation has to be matched again then.
         """
         known, settings = matched.known, state.settings
         if not len(known.ids):

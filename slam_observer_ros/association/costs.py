@@ -1,6 +1,7 @@
-"""What it costs to reject what is seen, to believe it, or to take the robot for slipped.
+"""The cost of each way to interpret an observation: lower is likelier.
 
-All costs are −2 ln of a likelihood, as in :mod:`.joint_compatibility`.
+A cost is −2 ln of a likelihood, as in :mod:`.joint_compatibility`. Costs of points add up, and the
+interpretation with the lowest sum is the likeliest one.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ from slam_observer_ros.state.matching import MatchedObservation, rejected_before
 from slam_observer_ros.state.state import State
 
 SLIP_COST = 20.0
-"""What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
+"""Cost of a slip of the robot, at odds of e¹⁰; what it sees afterwards costs extra."""
 
 SAME_CAUSE_COST = 3.0
-"""What it costs to reject another point for the reason for which one was rejected already."""
+"""Cost of each further point that is rejected for the cause of the first one."""
 
 MAX_OF_ONE_CAUSE = 3
-"""Points that cost this, at most: one garbled message is one, however many points it has."""
+"""Most points that are charged so: a garbled message is one, however many points it has."""
 
 
 def outlier_cost(state: State) -> float:
-    """Return what it costs that a point is of no known landmark."""
+    """Return the cost of a point that belongs to no known landmark."""
     return unpaired_cost(state.settings.rejection_threshold)
 
 
 def pairing_cost(state: State, m: int, residuals: Residuals) -> float:
-    """Return what it costs to take some of m points for the landmarks whose ids they have."""
+    """Return the cost of believing the ids of m points; what the gate rejects is an outlier."""
     r, noise = residuals.on(state.axes)
     passed, predicted = gated(
         r, state.filter.predicted(residuals)[1], noise, state.settings.rejection_threshold
@@ -49,12 +50,12 @@ def pairing_cost(state: State, m: int, residuals: Residuals) -> float:
 def rejection_cost(
     state: State, matched: MatchedObservation, rejected: BoolArray
 ) -> tuple[float, bool]:
-    """Return what it costs to reject landmarks, and whether there is a new cause for it.
+    """Return the cost of rejecting landmarks, and whether a new cause is needed for that.
 
-    The first time one cause is enough: the observation is garbled. The next time it is not, and
-    each landmark has moved for a cause of its own. From then on only how well it is seen at its
-    old position costs anything: landmarks that have moved must not throw the pose, however often
-    they are seen.
+    All landmarks of a first rejected observation share one cause: the message is garbled. In the
+    next rejected observation each landmark needs a cause of its own: it has moved. A landmark that
+    is rejected again at the same place costs only what :func:`cost_of_staying` says: landmarks
+    that have moved must not throw the pose, however often they are seen.
     """
     # Which were rejected before at this position, and which have a new cause.
     again, staying = cost_of_staying(state, matched)
@@ -71,11 +72,12 @@ def rejection_cost(
 
 
 def cost_of_staying(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
-    """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
+    """Return which landmarks (m,) were rejected before where they are now, and their costs (m,).
 
-    The last rejected position is known as well as the sensor measures: compared with the first
-    one, a landmark that goes on moving would pay for the same shift each time. No landmark costs
-    more than another outlier.
+    The cost grows with the distance from the position at which the landmark was last rejected,
+    both being measured by the sensor. The last position counts, as with the first one a landmark
+    that goes on moving would pay for the same shift each time. A landmark costs no more than an
+    outlier.
     """
     k, known = state.axes.point, matched.known
     noise = 2.0 * state.observer.turned(state.observation_noise.covariances(known))

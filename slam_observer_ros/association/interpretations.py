@@ -1,13 +1,13 @@
 """What an observation may mean: points without an id, and points whose id may be wrong.
 
-After a long blind stretch the gate is wide, and a wrong id passes it. Taken for the landmark that
-it names, such a point would close a loop where there is none and throw the pose. So there are two
-interpretations, that it is what its id says and that it is an outlier, and later observations
-decide. It may also be the landmark that is wrong, if such a point has put it there.
+After a long blind stretch the gate is wide, and a wrong id passes it. A point that is taken for
+the landmark of a wrong id closes a loop where there is none, and throws the pose. So there are two
+interpretations: the point is what its id says, or it is an outlier. Later observations decide. The
+landmark may be wrong as well, if such a point has put it there.
 
-The same holds for an observation most of which the gate rejects. It may be garbled, or of
-landmarks that have moved; or the robot is not where odometry has it, since its wheels slipped or
-someone carried it, and would be lost if it went on without what it sees.
+An observation that the gate mostly rejects has several interpretations, too. It is garbled, its
+landmarks have moved, or the robot is not where odometry has it: its wheels slipped, or someone
+carried it. A robot that ignored what it sees would then be lost.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ def _none() -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Interpretation:
-    """What an observation is taken for."""
+    """One of the meanings that an observation may have: a landmark or none for each point."""
 
-    event: ObservationEvent  # with all ids filled in, without points taken for outliers
-    cost: float  # −2 ln of its likelihood, up to what all interpretations share
-    slipped: State | None = None  # where the robot may have moved in any way since the last one
-    # Points left out though the gate lets them pass, of landmarks that were seen so seldom that
-    # these may be the outliers.
+    event: ObservationEvent  # all ids filled in, points taken for outliers left out
+    cost: float  # −2 ln of its likelihood, without what all interpretations share
+    slipped: State | None = None  # the state, if the robot moved in any way since the last one
+    # Points that the gate lets pass and that are left out all the same. Their landmarks were seen
+    # so seldom that the landmarks may be the outliers.
     disbelieved: ObservationEvent | None = None
-    # (j,) landmarks that had no id of their own so far, and the ids that they have now.
+    # (j,) landmarks that had no id of their own so far, and the ids that they get.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
 

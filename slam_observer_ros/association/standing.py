@@ -114,7 +114,7 @@ class _Pairs:
 
     @property
     def lagging(self) -> list[int]:
-        """Those that have not gone half of the way that they should have gone."""
+        """Landmarks that have not gone half of the way that they should have gone."""
         way, made = self.expected - self.before, self.points - self.before
         ahead = np.einsum('ij,ij->i', made - 0.5 * way, way).tolist()
         return [i for i, much in zip(self.ids, ahead, strict=True) if much <= 0.0]
@@ -260,7 +260,7 @@ class Standing:
         return lost
 
     def _belongs_to_start(self, event: ObservationEvent) -> bool:
-        """Return whether an observation is one of those that are compared with later ones."""
+        """Return whether later observations are compared with this one."""
         if all(event.sensor_frame != start.event.sensor_frame for start in self._starts):
             return True
         if len(self._starts[0].event.ids) >= LEAST:

@@ -1,4 +1,4 @@
-"""Which landmarks without an id should have been seen, and which were."""
+"""What a sensor sees of landmarks without an id: which should have been seen, and which were."""
 
 from __future__ import annotations
 
@@ -7,12 +7,61 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.association.field_of_view import FieldOfView
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.state.landmark_table import LandmarkTable
 from slam_observer_ros.state.state import State
+
+HULL_MARGIN = 0.01
+"""How far outside, as a share of what it measures across, a point may be and still be inside.
+
+Points are noisy, and without it each exact one at the sensor's full range would be a corner.
+"""
+
+
+class FieldOfView:
+    """The convex hull, in the body frame, of the base and of all points that were ever seen.
+
+    So no sensor has to be described. The hull is rather too large than too small: one wrong point
+    behind a camera, and it sees all around. Until it has an inside, which it never has where all
+    points lie in one plane with the base, everything counts as in view, and the latest points are
+    kept. Of points, the first ``k`` coordinates matter: 2 in the plane, 3 in space.
+    """
+
+    def __init__(self, k: int) -> None:
+        self.corners = np.zeros((1, k))  # (q, k) the base and points that span the hull, metres
+        self._faces: FloatArray = np.empty((0, k + 1))
+        self._margin_m = 0.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the hull has an inside."""
+        return len(self._faces) > 0
+
+    def include(self, points: FloatArray) -> None:
+        """Add points (m, 3) that were seen, metres, body frame."""
+        from scipy.spatial import ConvexHull, QhullError  # which only points without ids need
+
+        k = self.corners.shape[1]
+        known = self.contains(points) & self.is_known
+        if known.all():
+            return
+        corners = np.concatenate([self.corners, points[~known, :k]])
+        try:
+            hull = ConvexHull(corners)
+        except QhullError:  # all of them in one point, on one line or in one plane
+            self.corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
+            return
+        self.corners, self._faces = corners[hull.vertices], hull.equations
+        self._margin_m = HULL_MARGIN * float(np.ptp(self.corners, axis=0).max())
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Return which points (m, 3) lie where the sensor sees, metres, body frame."""
+        k = self.corners.shape[1]
+        heights_m = points[:, :k] @ self._faces[:, :k].T + self._faces[:, k]
+        return np.asarray((heights_m <= self._margin_m).all(axis=1))
+
 
 IMPROBABLE = 20.0
 """−ln of the probability below which it is no chance that none of several landmarks is seen."""
@@ -66,10 +115,10 @@ class Visibility:
         cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
         self.missed = self._missed(in_view & ~landmarks.tentative, seen)
         landmarks.note_in_view(rows, seen[rows], self._has_moved(state))
-        if not some_have_ids:  # those that a loaded map has by an id
+        if not some_have_ids:  # landmarks of a loaded map, by their ids
             landmarks.note_missed(np.flatnonzero(~is_numbered & in_view), seen)
         self._field_of_view.include(event.points)
-        # Those that were seen too seldom, and those that were confirmed.
+        # Landmarks seen too seldom, and landmarks that were confirmed.
         were_tentative = np.count_nonzero(landmarks.tentative)
         unsupported = landmarks.unsupported(state.settings.min_support)
         self.confirmed_now = int(were_tentative - np.count_nonzero(landmarks.tentative))

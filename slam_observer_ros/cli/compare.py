@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """One of those that are compared."""
+    """A trajectory or run that is compared with others."""
 
     trajectory: Trajectory
     figures: Mapping[str, object]
@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _request(args: argparse.Namespace, request: ReplayRequest, what: str) -> ReplayRequest | None:
-    """Return what is to be run for one of those that are compared; None for a trajectory."""
+    """Return the run that a compared name asks for; None for a trajectory."""
     if what in DESIGNS:
         request = request.with_values({'gains': what})
     elif Path(what).suffix in TUM_SUFFIXES:

@@ -159,7 +159,7 @@ def print_table(title: str, rows: Mapping[str, str]) -> None:
 
 
 def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a line for each of ``rows`` on standard output, the first of which is its name.
+    """Print a line for each of ``rows`` on standard output; its first entry is its name.
 
     Columns that don't fit beside each other follow below, in a table of their own.
     """

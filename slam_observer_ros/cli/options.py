@@ -109,7 +109,7 @@ def settings_of(
 ) -> Settings:
     """Build settings from defaults, ``--config``, ``--set`` and ``--gains``; later ones win.
 
-    ``other_names`` are those that ``--set`` takes for other settings of the command; ``instead``
+    ``other_names`` are names that ``--set`` takes for other settings of the command; ``instead``
     has the options that do what the node's parameters of these names do. A SlamObserverError is
     raised if a name or a value is wrong.
     """

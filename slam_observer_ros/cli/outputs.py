@@ -118,7 +118,7 @@ def check_directory(directory: Path) -> None:
 def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """Give a directory to write in, whose files go to ``directory`` when all are written.
 
-    Of ``names`` those that were not written this time are removed from there. Raises an
+    Files of these ``names`` that were not written are removed from there. Raises an
     OutputError if that fails.
     """
     beside = directory if directory.is_dir() else directory.parent

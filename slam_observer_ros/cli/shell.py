@@ -19,7 +19,7 @@ PATIENCE_S = 2.0
 
 
 class _Stop:
-    """Handles the first signal by an exception; those that follow cut its handling not short."""
+    """Handles the first signal by an exception; further ones do not cut that short."""
 
     def __init__(self) -> None:
         self._first_s: float | None = None

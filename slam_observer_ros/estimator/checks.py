@@ -58,7 +58,7 @@ _INTEGERS = (int, np.int64)
 
 
 def check_event(event: Event, settings: Settings) -> None:
-    """Check an event's shapes and values, velocities against those that settings allow.
+    """Check an event's shapes and values; the settings limit velocities.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def _is_plain(array: object) -> bool:
 
 
 def _check_numbers(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    """Check numbers of a map, none of which may be larger than in a file."""
+    """Check numbers of a map, which may not be larger than in a file."""
     _check_array(name, array, shape)
     if np.abs(array).max(initial=0.0) > MAX_NUMBER:
         raise InvalidEventError('too_large', f'an entry of the {name} is beyond {MAX_NUMBER:g}')

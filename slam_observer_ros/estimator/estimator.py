@@ -40,8 +40,7 @@ from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.innovation import lyapunov
-from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Outcome
@@ -468,7 +467,7 @@ class Estimator:
 
     @property
     def calibration(self) -> list[CalibrationEstimate]:
-        """Scale, bias and delay of the velocity, those that the settings ask for."""
+        """Scale, bias and delay of the velocity, as far as the settings ask for them."""
         return self._hypotheses.calibration
 
     @property

@@ -33,7 +33,7 @@ MAX_PENDING_VELOCITIES = 128
 
 
 class Moved(Protocol):
-    """What is moved along the velocities: hypotheses, the most likely of which is ``best``."""
+    """What is moved along the velocities: hypotheses; ``best`` is the most likely one."""
 
     @property
     def best(self) -> State:

@@ -45,7 +45,7 @@ class Localiser:
     """Follows whether the estimate is in the frame of a map that was loaded."""
 
     def __init__(self) -> None:
-        self.maps: list[LandmarkMap] = []  # in one of which the robot is
+        self.maps: list[LandmarkMap] = []  # the robot is in one of them
         self.loaded: LandmarkMap | None = None  # that one, once it is known
         self.is_localised = True  # in the final frame: always, unless a map was loaded
         self.counts: Counter[str] = Counter()  # 'not_localised' observations, poses 'lost'

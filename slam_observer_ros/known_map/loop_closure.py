@@ -30,7 +30,7 @@ MAX_SOUGHT = 12
 """New landmarks that are looked for among old ones, those seen last."""
 
 MAX_OLD = 400
-"""Old landmarks among which they are looked for, those that are nearest."""
+"""Old landmarks among which they are looked for: the nearest ones."""
 
 REACH = 4.0
 """Standard deviations of the pose within which a loop may close."""
@@ -188,7 +188,7 @@ def _within_reach(state: State, new: IntArray, old: IntArray) -> IntArray:
     off_m = np.linalg.norm(points[old] - centre, axis=1)
     nearest = np.argsort(off_m, kind='stable')[:MAX_OLD]
     old, off_m = old[nearest], off_m[nearest]
-    # Those that may lie among them, by how well it is known where these are to each other.
+    # Old landmarks that may lie among them, by how well it is known where these are to each other.
     S = _differences(state, np.full(len(old), new[0]), old)[1]
     spread_m = np.sqrt(np.trace(S, axis1=1, axis2=2))
     return np.sort(old[off_m <= 2.0 * radius_m + REACH * spread_m])

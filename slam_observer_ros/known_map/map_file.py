@@ -150,7 +150,7 @@ def read_map(path: Path) -> LandmarkMap:
 
 
 def read_maps(path: Path) -> list[LandmarkMap]:
-    """Read a map, or all of a folder, in one of which the robot is.
+    """Read a map, or all maps of a folder: the robot is in one of them.
 
     Raise :exc:`MapError` as :func:`read_map` does, or if there is none in the folder.
     """

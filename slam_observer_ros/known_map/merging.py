@@ -49,9 +49,9 @@ def enter_map(
     """Move an estimate into the frame of a map, if enough of its landmarks have been seen.
 
     ``pairs`` are landmarks (q,) of the estimate, and which of the map's (q,) they are; by default
-    those with the same ids. Return whether it is in that frame now. These are merged. Those that
-    contradict the others are taken as the map has them, and those that only the estimate has are
-    kept where mapping goes on.
+    landmarks with the same ids. Return whether it is in that frame now. Pairs are merged. A pair
+    that contradicts the others is taken as the map has it, and landmarks that only the estimate
+    has are kept where mapping goes on.
     """
     # The transform, by the landmarks that both have.
     rows, shared = _with_same_ids(state, known) if pairs is None else pairs
@@ -71,7 +71,7 @@ def enter_map(
         state.remove(wrong)
     else:
         state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[agree]))
-    # … and those that only the map has are added.
+    # … and landmarks that only the map has are added.
     _merge(state, known)
     return True
 

@@ -1,4 +1,4 @@
-"""The Cartesian errors of the map as the robot sees it, of which the filter's are half turned.
+"""The Cartesian errors of the map as the robot sees it; the filter's are half turned.
 
 With the attitude error w = ε_Ω and d_i = ξ_i − ε_v, which are normal in the filter's coordinates,
 a landmark is seen wrongly by R̂ᵀ J(w) d_i, J the left Jacobian of SO(3), exactly. Where

@@ -107,7 +107,7 @@ class Filter:
         raise NotImplementedError
 
     def add_orientations(self, seen: SeenOrientations) -> None:
-        """Take over orientations of which nothing is known yet, as they are seen."""
+        """Take over orientations as they are seen, where none is known yet."""
         raise NotImplementedError
 
     def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:

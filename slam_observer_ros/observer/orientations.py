@@ -96,8 +96,7 @@ def flip_verdicts(evidence: FloatArray, apart: FloatArray) -> tuple[BoolArray, B
     """Return which orientations (m,) are less likely than their twins, and which hardly likelier.
 
     ``evidence`` (m,) is by how much less they cost, as −2 ln of likelihood, ``apart`` (m,) how far
-    the twins are from them by the sensor's noise. Those that are as good as their twins are
-    neither.
+    the twins are from them by the sensor's noise. An orientation as good as its twin is neither.
     """
     differ = apart > FLIP_DISTANCE
     are_flipped = differ & (evidence < 0.0)

@@ -163,7 +163,7 @@ def _messages_of(data: mmap.mmap, piece: Piece, number_of: IntArray) -> _Message
 def _in_runs(
     messages: _Messages, topics: list[Topic], together: Topic
 ) -> Iterator[RawMessage | RawBlock]:
-    """Yield messages one by one, but in blocks those that follow each other on one topic."""
+    """Yield messages one by one; messages that follow each other on a topic come in blocks."""
     places = messages.places
     if len(places) < FEWEST_IN_BLOCK:
         yield from _one_by_one(messages, topics)

@@ -98,7 +98,7 @@ def select_topics(
     Parameters
     ----------
     topics, names, inputs
-        All topics of a recording, those that the user chose, and what of them is used.
+        All topics of a recording, the topics that the user chose, and what of them is used.
     has_ids : callable
         Whether the points of a cloud have ids. Clouds without them, such as a lidar's, are taken
         only if they are chosen by name or by their type, or are called ``landmarks``.

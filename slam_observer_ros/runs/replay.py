@@ -81,7 +81,7 @@ class Replay:
     localised_ns : (int, int) or None
         First and last stamp at which the pose in its final frame was known; None if it never was.
     events, observations, angular_velocities : int
-        Events, dropped ones included; observations of which points were used; angular velocities
+        Events, dropped ones included; observations with points that were used; angular velocities
         of an Imu that were taken in: all of them also before the last reset.
 
     """

@@ -27,7 +27,7 @@ class PoseSamples:
         self._poses: list[FloatArray] = []
 
     def due(self, stamps_ns: IntArray) -> list[int]:
-        """Return the rows of increasing stamps (s,) of which poses are to be added."""
+        """Return the rows of increasing stamps (s,) at which poses are to be added."""
         last_ns = self.stamps_ns[-1] if self.stamps_ns else None
         return due_rows(stamps_ns, last_ns, SAMPLE_PERIOD_NS)
 
@@ -52,7 +52,7 @@ class TrajectorySampler:
         self._covariances: list[FloatArray] = []
 
     def due(self, stamps_ns: IntArray) -> IntArray:
-        """Return those of increasing stamps (s,) of which poses are to be added."""
+        """Return the increasing stamps, among these (s,), at which poses are to be added."""
         return stamps_ns[self._samples.due(stamps_ns)]
 
     def add(self, stamps_ns: IntArray, poses: FloatArray, covariances: FloatArray | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from slam_observer_ros.settings.parameter_table import parameter
 
@@ -532,3 +532,20 @@ class Settings:
         minimum=0.0,
         maximum=1000.0,
     )
+
+
+class LiveSettings(Settings):
+    """The settings in force: a copy that follows changes, as some change while a node runs.
+
+    All that hold it see them, and copies share it.
+    """
+
+    @classmethod
+    def of(cls, settings: Settings) -> LiveSettings:
+        """Return such a copy."""
+        return cls(**{field.name: getattr(settings, field.name) for field in fields(settings)})
+
+    def follow(self, settings: Settings) -> None:
+        """Take over the values of other settings."""
+        for field in fields(self):
+            object.__setattr__(self, field.name, getattr(settings, field.name))

@@ -27,9 +27,8 @@ from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
-from slam_observer_ros.smoothing.observations import normal, Observations
+from slam_observer_ros.smoothing.observations import normal, Observations, SensedPoints
 from slam_observer_ros.smoothing.prior import inverse, Prior
-from slam_observer_ros.smoothing.sensed_points import SensedPoints
 
 
 @dataclass(frozen=True, slots=True)

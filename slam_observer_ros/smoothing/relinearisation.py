@@ -38,8 +38,8 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
+from slam_observer_ros.smoothing.observations import SensedPoints
 from slam_observer_ros.smoothing.prior import Prior
-from slam_observer_ros.smoothing.sensed_points import SensedPoints
 from slam_observer_ros.smoothing.slips import confirmed_slips
 
 logger = logging.getLogger(__name__)

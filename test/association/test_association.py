@@ -14,7 +14,6 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-from slam_observer_ros.association.field_of_view import FieldOfView
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
 from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
@@ -28,7 +27,7 @@ from slam_observer_ros.association.joint_compatibility import (
 )
 from slam_observer_ros.association.landmark_index import LandmarkIndex
 from slam_observer_ros.association.new_landmarks import NewLandmarks
-from slam_observer_ros.association.visibility import Visibility
+from slam_observer_ros.association.visibility import FieldOfView, Visibility
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -45,8 +44,7 @@ from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
-from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 from slam_observer_ros.state.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM

@@ -11,8 +11,7 @@ import pytest
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import table
 
 LIVE = [row for row in table(Settings) if not row.read_only]

@@ -55,7 +55,7 @@ class Pool:
     def run(
         self, work: Callable[[_Job], _Result], jobs: Iterable[_Job]
     ) -> Iterator[Ended[_Job, _Result]]:
-        """Do jobs; yield each when it has ended. Those that run when the caller stops are lost."""
+        """Do jobs; yield each when it has ended. Jobs that run when the caller stops are lost."""
         waiting = deque(jobs)
         while waiting:
             suspects: list[_Job] = []

@@ -79,7 +79,7 @@ class Material:
 def read_material(
     request: ReplayRequest, held_out_share: float, landmark_map: LandmarkMap | None = None
 ) -> Material:
-    """Read a recording, of which the last part is to be held out."""
+    """Read a recording; its last part is to be held out."""
     path = request.recording
     with Recording(path) as recording:
         selected, inputs, truth = select_inputs(request, recording)

@@ -300,7 +300,7 @@ class CompressedCovariance(JointCovariance):
     def _chosen(self, rows: IntArray) -> IntArray:
         """Return the landmarks to be active when ``rows`` (m,) are seen."""
         kept = max(self._size.kept, self._size.kept_per_seen * len(rows))
-        # But those that are just being added; a postponed shift makes no difference here.
+        # But landmarks that are just being added; a postponed shift makes no difference here.
         arms = self._observer.points[: len(self._places)] - self._observer.A[:3, 3]
         distances = np.einsum('ij,ij->i', arms, arms)
         near = np.argpartition(distances, min(kept, len(arms)) - 1)[:kept]

@@ -61,7 +61,7 @@ class OrientationGains(Filter):
         return weights, are_unclear
 
     def add_orientations(self, seen: SeenOrientations) -> None:
-        """Take over orientations as they are seen, for those of which nothing is known."""
+        """Take over orientations as they are seen, where none is known."""
         self.orientations.put(seen.rows, self.observer.A[:3, :3] @ seen.Z)
         self.joint.add_turns(seen.rows, self._noise(seen.covariances), seen.D)
 
@@ -75,7 +75,7 @@ class OrientationGains(Filter):
         variances = np.maximum(sigmas, RESOLUTION_RAD)[:, None, None] ** 2
         R = variances * np.eye(self.axes.turn)
         self.joint.add_known_turns(rows[new], R[new])
-        # Of those that both have, B̂_i B_iᵀ = exp(ω_i), unless they contradict each other.
+        # Of tags that both have, B̂_i B_iᵀ = exp(ω_i), unless they contradict each other.
         known, R = rows[own], R[own]
         omega = self.axes.turns(so3.log(self.orientations.B[known] @ transpose(B[own])))
         near = mahalanobis(omega, self.joint.own_turns(known) + R)
@@ -132,12 +132,12 @@ class OrientationGains(Filter):
         in_map, own = tags.are_known[copies], tags.are_known[rows]
         if not in_map.any():
             return
-        # Those of which only the map knows, …
+        # Orientations that only the map knows, …
         new, of_new = rows[in_map & ~own], copies[in_map & ~own]
         self.joint.copy_turns(of_new, new)
         seen = self._settings.max_rejections
         tags.put_known(new, tags.B[of_new], tags.map_sigmas[of_new], seen)
-        # … and those that both have, B̂_i B̂_jᵀ = exp(ω_i − ω_j), unless they are contradictory.
+        # … and what both have, B̂_i B̂_jᵀ = exp(ω_i − ω_j), unless they contradict each other.
         rows, copies = rows[in_map & own], copies[in_map & own]
         omega = self.axes.turns(so3.log(tags.B[rows] @ transpose(tags.B[copies])))
         R = RESOLUTION_RAD**2 * np.tile(np.eye(self.axes.turn), (len(rows), 1, 1))

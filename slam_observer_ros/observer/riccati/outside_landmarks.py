@@ -81,8 +81,8 @@ class View:
 class OutsideLandmarks:
     """B, the covariance of all η, and X = cov(η, x), both as of one instant.
 
-    The variables x of X are those that x had when it last started, (q₀), then the η of landmarks
-    that have been taken in since.
+    The columns of X are the variables that x had when it last started, (q₀), then the η of
+    landmarks that have been taken in since.
     """
 
     def __init__(self, chart: Chart, size: int) -> None:
@@ -228,13 +228,13 @@ class OutsideLandmarks:
             self.matrix.end()
 
     def moved(self, number: int, points: FloatArray, are_out: BoolArray) -> Moved:
-        """Return what a change makes of a panel, of which x does not have those that ``are_out``.
+        """Return what a change makes of a panel; landmarks that ``are_out`` are not in x.
 
         The change has not yet moved the estimates ``points`` (slots, 3) of its landmarks.
         """
         change, panel, k = self.unchanged[number], self.panels[number], self._axes.point
         at = change.slots // self.slots_each == number
-        new = change.slots[at] % self.slots_each  # those that were in x
+        new = change.slots[at] % self.slots_each  # landmarks that were in x
         were_out = are_out.copy()
         were_out[new] = False
         size = change.postponed.Phi.shape[1] - self._stride * len(change.taken)

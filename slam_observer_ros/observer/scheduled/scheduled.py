@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What m points ask for, a of which have passed the gate; see the module's docstring."""
+    """What m points ask for; a points have passed the gate. See the module's docstring."""
 
     Delta: FloatArray  # (q, 1) step Δ of the core
     gain_k: FloatArray  # (m, k, k) gains k_i, zero where the gate rejects a point
