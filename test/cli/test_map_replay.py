@@ -183,7 +183,7 @@ def test_of_a_folder_of_maps_it_is_said_in_which_the_robot_was_found(slam_observ
         known = LandmarkMap(np.arange(50), points, None, np.zeros(50, dtype=np.int64))
         write_map(halls / f'{name}.yaml', known, None)
     assert slam_observer.succeed(*arguments, '--json').json['map'] == 'west'
-    assert 'found in west after' in slam_observer(*arguments).output
+    assert ' s in west, where' in slam_observer(*arguments).output
     ended = slam_observer(*arguments, '--tum', halls / 'east.yaml', '--force')
     assert ended.code == 2
     assert 'the file of --load-map' in ended.errors

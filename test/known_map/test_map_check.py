@@ -79,9 +79,9 @@ def test_one_more_landmark_where_it_is_advised_makes_the_difference_where_it_is_
 
 
 def test_what_looks_the_same_is_logged_with_what_would_help(caplog):
-    warn_of_symmetry(hall(random_points(60)))
+    warn_of_symmetry(hall(random_points(60)), '')
     assert not caplog.text
-    warn_of_symmetry(hall(turned_by_half()))
+    warn_of_symmetry(hall(turned_by_half()), '')
     assert (
         "same turned by 180°: without ids or a start pose the robot can't be found" in caplog.text
     )

@@ -31,6 +31,7 @@ class Watched:
         self.estimator = SimpleNamespace(
             is_localised=is_localised,
             stamp_ns=stamp_ns,
+            map_name='',
             pose_covariance=None if deviations is None else np.diag(deviations) ** 2,
         )
         self.node = Mock()

@@ -287,7 +287,7 @@ class Publishing:
             counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
             calibration=[], motion_factors=[], lyapunov=0.0, stamp_ns=None,
             velocity_is_stale=False, is_localised=True,
-            localisation_problem='what was seen fits 2 places',
+            localisation_problem='what was seen fits 2 places', possible_poses=np.empty((0, 4, 4)),
         )  # fmt: skip
         vars(self.estimator).update(estimate)
         self.feed = SimpleNamespace(

@@ -144,9 +144,9 @@ def _loss_text(outcome: ReplayOutcome) -> str:
 
 def _localisation_text(result: Replay, localised_after_s: float) -> str:
     name = f' in {result.estimator.map_name}' if result.estimator.map_name else ''
-    found = f'found{name} after {localised_after_s:.1f} s, where the trajectory begins'
+    found = f'found after {localised_after_s:.1f} s{name}, where the trajectory begins'
     if result.estimator.settings.set_initial_pose and localised_after_s == 0.0:
-        found = f'given{name} at the start'
+        found = f'given at the start{name}'
     lost = result.estimator.counts['lost']
     return f'{found}; lost {lost} × and searched again' if lost else found
 

@@ -9,10 +9,10 @@ of x, H x being observed with the covariance S and the residual r, leaves
     η̂         moved by  −X g,    g = (H Φ)ᵀ S⁻¹ r,
 
 whatever η is and however many of them there are. Where some of the η become part of x, X has the
-columns cov(η, η_i) of B, too: Φ and Ψ grow by these. On the group, X̂ ← exp(−K r) · X̂, the shift a
-of a landmark since its reference becomes D a − J X_i g, with D = exp(ε_Ω) and its left Jacobian J;
-over many corrections D₁ a + T X_i, with a tensor T. A tag's orientation turns by exp(−X_i g) each
-time. See docs/theory.md, Large maps.
+columns cov(η, η_i) of B, too: Φ and Ψ grow by these. On the group, X̂ ← exp(−K r) · X̂, the shift
+a of a landmark since its reference becomes D a − J X_i g, with D = exp(ε_Ω) and its left
+Jacobian J; over many corrections D₁ a + T X_i, with a tensor T. A tag's orientation turns by
+exp(−X_i g) each time. See docs/theory.md, Large maps.
 """
 
 from __future__ import annotations
