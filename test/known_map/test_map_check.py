@@ -79,11 +79,12 @@ def test_one_more_landmark_where_it_is_advised_makes_the_difference_where_it_is_
 
 
 def test_what_looks_the_same_is_logged_with_what_would_help(caplog):
-    warn_of_symmetry(hall(random_points(60)), '')
+    warn_of_symmetry(hall(random_points(60)), 'hall')
     assert not caplog.text
-    warn_of_symmetry(hall(turned_by_half()), '')
+    warn_of_symmetry(hall(turned_by_half()), 'hall')
     assert (
-        "same turned by 180°: without ids or a start pose the robot can't be found" in caplog.text
+        'Map hall is the same turned by 180°: without ids or a start pose the robot '
+        "can't be found" in caplog.text
     )
     assert 'one more landmark, at (' in caplog.text
 
