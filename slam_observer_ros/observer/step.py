@@ -44,9 +44,9 @@ from slam_observer_ros.observer.robust import (
 from slam_observer_ros.sensor_models.motion_noise import (
     Factors,
     learnt,
+    motion_variances,
     MotionFigures,
     score,
-    SPEED_WINDOW_S,
 )
 from slam_observer_ros.sensor_models.observation_noise import (
     point_covariances,
@@ -60,7 +60,6 @@ from slam_observer_ros.sensor_models.velocity_history import Velocities
 UNUSUAL, AT_REST, DONE = -1, 0, 1
 """What a step returns; AT_REST where the motion says nothing of the noise of velocities."""
 
-_TINY = np.finfo(np.float64).tiny
 _PLANAR = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
 LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -87,7 +86,10 @@ def advance(
     out.A[:3, :3] = so3.normalise(path[-1, :3, :3])
     # ε ← ε + F c̃ + w,  w ~ N(0, Σ Ad_Â Q Ad_Âᵀ)
     Ad = se3.adjoint(path)[:, axes.pose]
-    Q = _variances(V, dt_s, before_s, velocities, interval, figures)
+    # White noise: held longer than usual, one error has moved the robot by so much more.
+    usual_s = np.array([velocities.usual_angular_s, velocities.usual_linear_s])
+    usual_s += max(to_s(-interval.delay_ns), 0.0)
+    Q = motion_variances(V, dt_s, before_s, usual_s, figures)
     out.variances[:] = Q.sum(axis=0)
     _summed_noise(Ad, se3.at_poses(Q), out)
     F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
@@ -132,44 +134,6 @@ def _counting(V: FloatArray, is_planar: bool) -> FloatArray:
 def _calibrated(x: Estimate, V: FloatArray) -> FloatArray:
     """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so."""
     return V * x.calibration[:6] + np.asarray(V.any(axis=-1))[..., None] * x.calibration[6:12]
-
-
-def _variances(
-    V: FloatArray,
-    dt_s: FloatArray,
-    before_s: FloatArray,
-    velocities: Velocities,
-    interval: Interval,
-    figures: MotionFigures,
-) -> FloatArray:
-    """Return the variances (k, 6) of what each velocity moves the robot by."""
-    # White noise: held longer than usual, one error has moved the robot by so much more.
-    usual_s = np.array([velocities.usual_angular_s, velocities.usual_linear_s])
-    usual_s += max(to_s(-interval.delay_ns), 0.0)
-    until_s = before_s + dt_s[:, None]
-    white_s: FloatArray = dt_s[:, None]
-    if np.count_nonzero(until_s > usual_s):
-        grown_s = until_s * np.maximum(until_s / usual_s, 1.0)
-        grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
-        white_s = grown_s.repeat(3, axis=1)
-    Q = figures.densities * white_s
-    if np.count_nonzero(figures.scales):
-        Q += (figures.scales * _averaged(V, dt_s)) ** 2 * dt_s[:, None]
-    return Q * figures.factors.repeat(3)
-
-
-def _averaged(V: FloatArray, dt_s: FloatArray) -> FloatArray:
-    """Return the mean velocities (k, 6) over a window around the middle of each."""
-    times_s = np.append(0.0, np.cumsum(dt_s))
-    motions = np.zeros((len(times_s), 6))
-    np.cumsum(dt_s[:, None] * V, axis=0, out=motions[1:])
-    middles_s, numbers = 0.5 * (times_s[:-1] + times_s[1:]), np.arange(len(dt_s))
-    starts = np.minimum(times_s.searchsorted(middles_s - 0.5 * SPEED_WINDOW_S), numbers)
-    ends = times_s.searchsorted(middles_s + 0.5 * SPEED_WINDOW_S, side='right') - 1
-    ends = np.maximum(ends, numbers + 1)
-    lengths_s = np.maximum(times_s[ends] - times_s[starts], _TINY)
-    means: FloatArray = (motions[ends] - motions[starts]) / lengths_s[:, None]
-    return means
 
 
 def _summed_noise(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:

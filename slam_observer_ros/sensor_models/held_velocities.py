@@ -58,23 +58,6 @@ class HeldVelocities:
         """Return the same, as when velocities were held for ``usual_s`` (2,) as a rule."""
         return replace(self, usual_s=usual_s)
 
-    def averaged(self, window_s: float) -> FloatArray:
-        """Return the mean velocities (k, 6) over windows around the middle of each one.
-
-        As far as they are held here; one that was held for longer than the window is its own mean.
-        """
-        times_s = np.append(0.0, np.cumsum(self.dt_s))
-        motions = np.zeros((len(times_s), 6))
-        np.cumsum(self.dt_s[:, None] * self.body_velocities, axis=0, out=motions[1:])
-        middles_s = 0.5 * (times_s[:-1] + times_s[1:])
-        numbers = np.arange(len(middles_s))
-        starts = np.minimum(np.searchsorted(times_s, middles_s - 0.5 * window_s), numbers)
-        ends = np.searchsorted(times_s, middles_s + 0.5 * window_s, side='right') - 1
-        ends = np.maximum(ends, numbers + 1)
-        lengths_s = np.maximum(times_s[ends] - times_s[starts], np.finfo(np.float64).tiny)
-        means: FloatArray = (motions[ends] - motions[starts]) / lengths_s[:, None]
-        return means
-
 
 @dataclass(frozen=True, slots=True)
 class HeldUntil:
@@ -106,3 +89,21 @@ class HeldUntil:
             if field.name != 'usual_s'
         }
         return HeldVelocities(**joined, usual_s=self.usual_s[row])
+
+
+def averaged(body_velocities: FloatArray, dt_s: FloatArray, window_s: float) -> FloatArray:
+    """Return the mean velocities (k, 6) over windows around the middle of each of k pieces.
+
+    As far as they are held here; one that was held for longer than the window is its own mean.
+    """
+    times_s = np.append(0.0, np.cumsum(dt_s))
+    motions = np.zeros((len(times_s), 6))
+    np.cumsum(dt_s[:, None] * body_velocities, axis=0, out=motions[1:])
+    middles_s = 0.5 * (times_s[:-1] + times_s[1:])
+    numbers = np.arange(len(middles_s))
+    starts = np.minimum(times_s.searchsorted(middles_s - 0.5 * window_s), numbers)
+    ends = times_s.searchsorted(middles_s + 0.5 * window_s, side='right') - 1
+    ends = np.maximum(ends, numbers + 1)
+    lengths_s = np.maximum(times_s[ends] - times_s[starts], np.finfo(np.float64).tiny)
+    means: FloatArray = (motions[ends] - motions[starts]) / lengths_s[:, None]
+    return means

@@ -36,7 +36,7 @@ from slam_observer_ros.geometry.matrices import (
     mahalanobis,
     solve_definite,
 )
-from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+from slam_observer_ros.sensor_models.held_velocities import averaged, HeldVelocities
 from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
 MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
@@ -117,14 +117,10 @@ class MotionNoise:
     def covariances(self, held: HeldVelocities) -> FloatArray:
         """Return what k motions may be off by: (k, 6, 6), rad² and m²."""
         dt_s, some_are_stated = held.dt_s[:, None], np.count_nonzero(held.is_stated)
-        # White noise of the stated density, and in proportion to the mean speed: a single message
-        # is noisy itself, and its square too large.
-        s = self._settings  # which may change
-        variances = _squares(s.angular_velocity_noise, s.linear_velocity_noise) * _white_s(held)
-        if self._has_scale:
-            variances += (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2 * dt_s
+        variances = motion_variances(
+            held.body_velocities, held.dt_s, held.before_s, held.usual_s, self.figures
+        )
         factors = self.factors.applied.repeat(3)
-        variances = variances * factors
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         # In a gap the robot may do anything that is allowed.
@@ -150,7 +146,8 @@ class MotionNoise:
 
     def is_summed(self, held: HeldVelocities) -> bool:
         """Return whether what one motion may be off by does not depend on others."""
-        return not (self._has_scale or _some_last_longer(held))
+        last_longer = _some_last_longer(held.before_s + held.dt_s[:, None], held.usual_s)
+        return not (self._has_scale or last_longer)
 
     def velocity_covariance(self, held: HeldVelocities) -> FloatArray:
         """Return what a single velocity may be off by: (6, 6), rad²/s² and m²/s²."""
@@ -165,22 +162,42 @@ def _squares(angular: Vector3, linear: Vector3) -> FloatArray:
     return squares
 
 
-def _some_last_longer(held: HeldVelocities) -> bool:
-    return bool(np.count_nonzero(held.before_s + held.dt_s[:, None] > held.usual_s))
+def _some_last_longer(until_s: FloatArray, usual_s: FloatArray) -> bool:
+    return bool(np.count_nonzero(until_s > usual_s))
 
 
-def _white_s(held: HeldVelocities) -> FloatArray:
-    """Return variances over their density: (k, 6), or (k, 1) if one for all axes.
+def motion_variances(
+    V: FloatArray,
+    dt_s: FloatArray,
+    before_s: FloatArray,
+    usual_s: FloatArray,
+    figures: MotionFigures,
+) -> FloatArray:
+    """Return the variances (k, 6) of what velocities (k, 6) without a stated covariance move by.
+
+    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), and for ``usual_s`` (2,) as a rule,
+    seconds.
+    """
+    # White noise of the stated density, and in proportion to the mean speed: a single message is
+    # noisy itself, and its square too large.
+    variances = figures.densities * _white_s(before_s, dt_s[:, None], usual_s)
+    if np.count_nonzero(figures.scales):
+        variances += (figures.scales * averaged(V, dt_s, SPEED_WINDOW_S)) ** 2 * dt_s[:, None]
+    grown: FloatArray = variances * figures.factors.repeat(3)
+    return grown
+
+
+def _white_s(before_s: FloatArray, dt_s: FloatArray, usual_s: FloatArray) -> FloatArray:
+    """Return variances over their density: (k, 6), or ``dt_s`` (k, 1) if one for all axes.
 
     The density is that of errors which are new in each message. Held for t, longer than the
     usual T, one of them has moved the robot by t/T times as much: t²/T, not t. Slip is as before.
     """
-    dt_s = held.dt_s[:, None]
-    if not _some_last_longer(held):  # as nearly always
+    until_s = before_s + dt_s
+    if not _some_last_longer(until_s, usual_s):  # as nearly always
         return dt_s
-    until_s = held.before_s + dt_s
-    grown_s = until_s * np.maximum(until_s / held.usual_s, 1.0)
-    grown_s -= held.before_s * np.maximum(held.before_s / held.usual_s, 1.0)
+    grown_s = until_s * np.maximum(until_s / usual_s, 1.0)
+    grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
     return np.repeat(grown_s, 3, axis=1)
 
 
