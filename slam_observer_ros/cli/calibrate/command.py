@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -25,15 +25,20 @@ from slam_observer_ros.cli.console import (
     print_table,
     shown_steps,
 )
-from slam_observer_ros.cli.options import add_settings_options, Given, named_path, read_given
+from slam_observer_ros.cli.options import Given, named_path, read_given
 from slam_observer_ros.cli.outputs import (
-    add_force_option,
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay.request import add_input_options, read_request, ReplayRequest
+from slam_observer_ros.cli.replay.request import read_request, ReplayRequest
 from slam_observer_ros.cli.replay.run import select_inputs
-from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
+from slam_observer_ros.cli.tune.material import (
+    add_material_options,
+    check_seen,
+    HELD_OUT_SHARE,
+    Material,
+    read_material,
+)
 from slam_observer_ros.cli.tune.tuned_file import (
     certainty,
     judged_lines,
@@ -45,13 +50,13 @@ from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.runs.health import of_mounting, of_noise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -73,31 +78,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='map file of surveyed landmarks',
     )
     parser.add_argument(
-        '--hold-out',
-        action='append',
-        default=[],
-        type=named_path,
-        metavar='RECORDING',
-        help='hold this one out, and take all of the other; may be given several times',
-    )
-    parser.add_argument(
         '--keep-noise',
         action='store_true',
         help='leave the noise of points as it is stated, which takes a third of the time',
     )
-    outputs = parser.add_argument_group('outputs')
-    outputs.add_argument(
-        '-o',
-        '--out',
-        type=named_path,
-        metavar='FILE',
-        help='parameter file to write if it is an improvement',
-    )
-    outputs.add_argument('--json', action='store_true', help='print one JSON object')
-    add_force_option(parser)
-    add_input_options(parser)
-    add_settings_options(parser, InputSettings)
-    parser.set_defaults(run=run, smooth=False, load_map=None)
+    add_material_options(parser, 'take all of the other', '-o', '--out')
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -122,8 +108,12 @@ def run(args: argparse.Namespace) -> None:
         found = Finder(material, request.settings, given.assigned, advance).find(args.keep_noise)
         pose = _sensor_pose(request, found)
         stated = state_found(request.settings, request.inputs, found, pose)
-        stated, verdict = _judged(request, args.hold_out, material, stated, found)
-        trained_on = read_material(replace(request, inputs=stated.inputs), share, survey)
+        noisy = with_noise(stated, found, not _states_motion(material))
+        corrected = replace(request, inputs=stated.inputs)
+        trained_on = read_material(corrected, share, survey)
+        others = _held_out(request, corrected, args.hold_out, survey)
+        held_out = others if args.hold_out else [(material, trained_on)]
+        stated, verdict = _judged(request.settings, stated, noisy, held_out)
         gain = growth(
             material.likelihood(request.settings), trained_on.likelihood(stated.settings)
         )
@@ -143,33 +133,45 @@ def _sensor_pose(request: ReplayRequest, found: Found) -> FloatArray | None:
         return recording.sensor_pose(selected, inputs, next(iter(found.frames)))
 
 
-def _judged(
+def _held_out(
     request: ReplayRequest,
-    held_out: Sequence[Path],
-    material: Material,
+    corrected: ReplayRequest,
+    paths: Sequence[Path],
+    survey: LandmarkMap | None,
+) -> Iterator[tuple[Material, Material]]:
+    """Read what is held out, one recording after the other, as two requests have it."""
+    for path in paths:
+        before, after = (replace(one, recording=path) for one in (request, corrected))
+        yield read_material(before, 1.0, survey), read_material(after, 1.0, survey)
+
+
+def _states_motion(material: Material) -> bool:
+    """Return whether some velocities come with their covariances."""
+    return any(
+        event.covariance is not None
+        for event in material.events
+        if isinstance(event, VelocityEvent)
+    )
+
+
+def _judged(
+    settings: Settings,
     stated: Stated,
-    found: Found,
+    noisy: Stated,
+    held_out: Iterable[tuple[Material, Material]],
 ) -> tuple[Stated, Verdict]:
-    """Judge on what was held out; leave the noise as it was if that is no improvement."""
-    share = 1.0 if held_out else HELD_OUT_SHARE
+    """Judge on what was held out, as it was and with the sensor where it was found to be.
 
-    def results(settings: Settings, inputs: InputSettings) -> list[Judged]:
-        asked = replace(request, settings=settings, inputs=inputs)
-        judged = [
-            read_material(replace(asked, recording=path), share, material.landmark_map).judged(
-                settings
-            )
-            for path in held_out or [request.recording]
-        ]
-        if not all(len(one.likelihood.stamps_ns) for one in judged):
-            raise UsageError('nothing is seen twice in what is held out')
-        return judged
-
-    before = results(request.settings, request.inputs)
-    after = results(stated.settings, stated.inputs)
-    velocities = (event for event in material.events if isinstance(event, VelocityEvent))
-    noisy = with_noise(stated, found, all(event.covariance is None for event in velocities))
-    after_noise = results(noisy.settings, noisy.inputs)
+    The noise is left as it was if that is no improvement.
+    """
+    before: list[Judged] = []
+    after: list[Judged] = []
+    after_noise: list[Judged] = []
+    for given, corrected in held_out:
+        before.append(given.judged(settings))
+        after.append(corrected.judged(stated.settings))
+        after_noise.append(corrected.judged(noisy.settings))
+    check_seen([*before, *after, *after_noise])
     if not judge(after, after_noise).objection:
         stated, after = noisy, after_noise
     return stated, judge(before, after)

@@ -8,14 +8,19 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
-from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
+from slam_observer_ros.cli.options import named_path, read_given
 from slam_observer_ros.cli.outputs import (
-    add_force_option,
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay.request import add_input_options, read_request, ReplayRequest
-from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
+from slam_observer_ros.cli.replay.request import read_request, ReplayRequest
+from slam_observer_ros.cli.tune.material import (
+    add_material_options,
+    check_seen,
+    HELD_OUT_SHARE,
+    Material,
+    read_material,
+)
 from slam_observer_ros.cli.tune.noise_kinds import kinds_of, NoiseKind, scaled
 from slam_observer_ros.cli.tune.search import Found, search_noise
 from slam_observer_ros.cli.tune.tuned_file import certainty, rounded, verdict_lines, write_tuned
@@ -24,7 +29,6 @@ from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -35,26 +39,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'third of each. If it does not, no file is written, and the exit code is 4.'
     )
     parser.add_argument('recordings', nargs='+', type=named_path, metavar='RECORDING')
-    parser.add_argument(
-        '--hold-out',
-        action='append',
-        default=[],
-        type=named_path,
-        metavar='RECORDING',
-        help='hold this one out, and train on all of the others; may be given several times',
-    )
-    outputs = parser.add_argument_group('outputs')
-    outputs.add_argument(
-        '--out',
-        type=named_path,
-        metavar='FILE',
-        help='parameter file to write if it is an improvement',
-    )
-    outputs.add_argument('--json', action='store_true', help='print one JSON object')
-    add_force_option(parser)
-    add_input_options(parser)
-    add_settings_options(parser, InputSettings)
-    parser.set_defaults(run=run, smooth=False, load_map=None)
+    add_material_options(parser, 'train on all of the others', '--out')
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -120,8 +106,7 @@ def _verdict(
         )
         before.append(material.judged(request.settings))
         after.append(material.judged(tuned))
-    if not all(len(judged.likelihood.stamps_ns) for judged in (*before, *after)):
-        raise UsageError('nothing is seen twice in what is held out')
+    check_seen([*before, *after])
     return judge(before, after)
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.cli.replay.request import ReplayRequest
+from slam_observer_ros.cli.options import add_settings_options, named_path
+from slam_observer_ros.cli.outputs import add_force_option
+from slam_observer_ros.cli.replay.request import add_input_options, ReplayRequest
 from slam_observer_ros.cli.replay.run import select_inputs
 from slam_observer_ros.cli.replay.summary import sha256_of
 from slam_observer_ros.cli.tune.verdict import Judged
@@ -22,6 +25,7 @@ from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.runs.likelihood import Likelihood, LikelihoodRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import InputSettings
 
 HELD_OUT_SHARE = 1.0 / 3.0
 """Part of a recording, at its end, that is held out where no other recording is."""
@@ -99,3 +103,35 @@ def read_material(
     reach_m = max(float(np.linalg.norm(event.points, axis=1).max()) for event in seen)
     digest = sha256_of(path)
     return Material(path, digest, events, truth, reach_m, split_ns, landmark_map)
+
+
+def check_seen(judged: Iterable[Judged]) -> None:
+    """Raise a UsageError if there is nothing to judge in what was held out."""
+    if not all(len(one.likelihood.stamps_ns) for one in judged):
+        raise UsageError('nothing is seen twice in what is held out')
+
+
+def add_material_options(
+    parser: argparse.ArgumentParser, trained_on: str, *out_flags: str
+) -> None:
+    """Add what is held out beside what is ``trained_on``, and the parameter file that results."""
+    parser.add_argument(
+        '--hold-out',
+        action='append',
+        default=[],
+        type=named_path,
+        metavar='RECORDING',
+        help=f'hold this one out, and {trained_on}; may be given several times',
+    )
+    outputs = parser.add_argument_group('outputs')
+    outputs.add_argument(
+        *out_flags,
+        type=named_path,
+        metavar='FILE',
+        help='parameter file to write if it is an improvement',
+    )
+    outputs.add_argument('--json', action='store_true', help='print one JSON object')
+    add_force_option(parser)
+    add_input_options(parser)
+    add_settings_options(parser, InputSettings)
+    parser.set_defaults(smooth=False, load_map=None)
