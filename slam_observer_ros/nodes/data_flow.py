@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
@@ -15,6 +13,7 @@ from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
@@ -37,7 +36,7 @@ class DataFlow:
 
     Parameters
     ----------
-    node : Node
+    node : GuardedNode
     settings : ObserverNodeSettings
     estimator_settings : Settings
     on_update : callable
@@ -58,7 +57,7 @@ class DataFlow:
 
     def __init__(
         self,
-        node: Node,
+        node: GuardedNode,
         settings: ObserverNodeSettings,
         estimator_settings: Settings,
         on_update: Callable[[Update], None],
@@ -84,10 +83,9 @@ class DataFlow:
         )
         self.inputs = open_inputs(node, settings, self.feed)
         _refuse_own_outputs(node, self.inputs)
-        # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
-        create = partial(node.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._publish_timer = create(1.0 / settings.publish_rate, self._publish_waiting)
-        self._retry_timer = create(RETRY_PERIOD_S, self._retry)
+        period_s = 1.0 / settings.publish_rate
+        self._publish_timer = node.create_steady_timer(period_s, self._publish_waiting)
+        self._retry_timer = node.create_steady_timer(RETRY_PERIOD_S, self._retry)
         self.timers = [self._publish_timer, self._retry_timer]
         self._is_catching_up = False
         window_s = estimator_settings.reorder_window

@@ -9,7 +9,10 @@ import traceback
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock as SteadyClock
+from rclpy.clock import ClockType
 from rclpy.node import Node
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from slam_observer_ros.nodes.logs import ThrottledLog
@@ -31,6 +34,7 @@ class GuardedNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         self.failures: Counter[str] = Counter()
         self.last_failure = ''
         self._failure_log = ThrottledLog(self)
+        self._steady_clock = SteadyClock(clock_type=ClockType.STEADY_TIME)
         super().__init__(*args, **kwargs)
 
     def create_subscription(
@@ -48,6 +52,11 @@ class GuardedNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         return super().create_timer(
             timer_period_sec, self.guarded(callback, what), *args, **kwargs
         )
+
+    def create_steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
+        """Create a timer by a steady clock: with use_sim_time ROS's may stand still or jump."""
+        # rclpy's executor warns of a clock with eight timers or more.
+        return self.create_timer(period_s, callback, clock=self._steady_clock)
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *args: Any, **kwargs: Any

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
-from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
+from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
@@ -126,9 +124,7 @@ class ObserverCore:
         node.add_post_set_parameters_callback(self._apply_parameters)
 
     def _create_timers(self) -> list[Timer]:
-        # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
-        create = partial(self._node.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        # One of each period: rclpy's executor warns of a clock with eight timers or more.
+        create = self._node.create_steady_timer
         return [
             create(CHECK_PERIOD_S, self._check),
             create(OVERVIEW_PERIOD_S, self._publish_overview),

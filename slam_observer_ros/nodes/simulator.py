@@ -6,8 +6,6 @@ from collections.abc import Iterator
 import time
 
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
-from rclpy.clock import Clock as RosClock
-from rclpy.clock import ClockType
 from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
@@ -44,8 +42,7 @@ class SimulatorNode(RepeatableParameters):
         self._scenario = read_settings(self, Scenario)
         self._create_publishers()
         self._log = ThrottledLog(self)
-        self._steady_clock = RosClock(clock_type=ClockType.STEADY_TIME)
-        self._wait_timer = self.create_timer(TICK_S, self._wait, clock=self._steady_clock)
+        self._wait_timer = self.create_steady_timer(TICK_S, self._wait)
 
     def _create_publishers(self) -> None:
         twist_class = TwistStamped if self._settings.stamped else Twist
@@ -78,7 +75,7 @@ class SimulatorNode(RepeatableParameters):
             return
         self.destroy_timer(self._wait_timer)
         delay_s = MATCH_DELAY_S if needed else 0.0
-        self._start_timer = self.create_timer(delay_s, self._start, clock=self._steady_clock)
+        self._start_timer = self.create_steady_timer(delay_s, self._start)
 
     def _start(self) -> None:
         self.destroy_timer(self._start_timer)
@@ -94,7 +91,7 @@ class SimulatorNode(RepeatableParameters):
         if self._publishes_clock:  # which can stand still until reliable readers have heard
             self._publish_until(self._start_ns)
             self._give_up_s += ACKNOWLEDGED_S
-        self._start_timer = self.create_timer(TICK_S, self._drive, clock=self._steady_clock)
+        self._start_timer = self.create_steady_timer(TICK_S, self._drive)
 
     def _drive(self) -> None:
         """Let time pass once the first messages are acknowledged: their readers hear the rest."""
@@ -105,7 +102,7 @@ class SimulatorNode(RepeatableParameters):
             return
         self.destroy_timer(self._start_timer)
         self._start_wall_s = time.monotonic()
-        self.create_timer(TICK_S, self._publish_due, clock=self._steady_clock)
+        self.create_steady_timer(TICK_S, self._publish_due)
         self.get_logger().info('the robot starts')
 
     def _publish_due(self) -> None:

@@ -201,33 +201,28 @@ class VelocityHistory:
 
     def flat(self) -> Velocities:
         """Return all that are known as plain arrays."""
-        count, joined = len(self._stamps_ns), self._written()
+        return self._flat(len(self._stamps_ns), *self._usual_s())
+
+    def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
+        """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
+        counts = self.flat().stamps_ns.searchsorted(stamps_ns, 'right')
+        usual_s = self._joined.usual_s[counts - 1].tolist()
+        return [
+            self._flat(count, *each) for count, each in zip(counts.tolist(), usual_s, strict=True)
+        ]
+
+    def _flat(self, count: int, usual_angular_s: float, usual_linear_s: float) -> Velocities:
+        """Return the first so many."""
+        joined = self._written()
         return Velocities(
             joined.stamps_ns[:count],
             joined.body_velocities[:count],
             joined.since_ns[:count],
             joined.is_stated[:count],
-            *self._usual_s(),
+            usual_angular_s,
+            usual_linear_s,
             self._timeout_ns,
         )
-
-    def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
-        """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
-        known = self.flat()
-        counts = known.stamps_ns.searchsorted(stamps_ns, 'right')
-        usual_s = self._joined.usual_s[counts - 1].tolist()
-        return [
-            Velocities(
-                known.stamps_ns[:count],
-                known.body_velocities[:count],
-                known.since_ns[:count],
-                known.is_stated[:count],
-                angular_s,
-                linear_s,
-                self._timeout_ns,
-            )
-            for count, (angular_s, linear_s) in zip(counts.tolist(), usual_s, strict=True)
-        ]
 
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
