@@ -86,6 +86,7 @@ class DeadReckoning:
         self._pose = np.eye(4)
         self._samples = PoseSamples(keep_all)
         self._pending: list[tuple[FloatArray, IntArray]] = []
+        self._most_pending = MOST_PENDING if keep_all else 1
         self._has_begun = False
         self._end_ns = 0
 
@@ -95,7 +96,7 @@ class DeadReckoning:
         self._has_begun = self._has_begun or bool(held.dt_s.any())
         if not self._has_begun:
             return
-        if start_ns != self._end_ns or len(self._pending) == MOST_PENDING:
+        if start_ns != self._end_ns or len(self._pending) == self._most_pending:
             self._move_on()
         elapsed_s = np.append(0.0, np.cumsum(held.dt_s + held.gap_s))
         stamps_ns = start_ns + np.rint(elapsed_s * NANOSECONDS_PER_SECOND).astype(np.int64)
