@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.events import ObservationEvent
 
 MEMORY_S = 60.0

@@ -9,8 +9,8 @@ import numpy as np
 from slam_observer_ros.association.joint_compatibility import huber_loss
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.matrices import solve_symmetric, transpose
+from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.state.matching import MatchedObservation

@@ -27,9 +27,9 @@ from slam_observer_ros.cli.replay.request import (
 from slam_observer_ros.cli.replay.run import replayed, select_inputs
 from slam_observer_ros.cli.replay.summary import as_json, NEARLY_ALL
 from slam_observer_ros.common.errors import EvaluationError, UsageError
+from slam_observer_ros.evaluation.drawing import SUFFIXES
+from slam_observer_ros.evaluation.map_plot import plot_overlay
 from slam_observer_ros.evaluation.metrics import trajectory_errors
-from slam_observer_ros.evaluation.plots.drawing import SUFFIXES
-from slam_observer_ros.evaluation.plots.map_plot import plot_overlay
 from slam_observer_ros.evaluation.relative_errors import trajectory_figures
 from slam_observer_ros.evaluation.trajectory import read_tum, Trajectory
 from slam_observer_ros.observer.designs import DESIGNS

@@ -1,4 +1,4 @@
-"""What the user sees: messages and progress on standard error, results on standard output."""
+"""What the command line says: results on standard output, messages and progress beside them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import logging
 import sys
 import threading
 from typing import TypeVar
+
+from rich.table import Table
 
 from slam_observer_ros.cli.shell import leaving_at_once
 from slam_observer_ros.common.digits import json_text
@@ -153,7 +155,7 @@ def print_table(title: str, rows: Mapping[str, str]) -> None:
     with leaving_at_once():
         from rich.console import Console
 
-        from slam_observer_ros.common.tables import table_of
+        from slam_observer_ros.cli.console import table_of
 
     Console(highlight=False, markup=False).print(table_of(title, rows))
 
@@ -167,7 +169,7 @@ def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[s
         from rich.cells import cell_len
         from rich.console import Console
 
-        from slam_observer_ros.common.tables import columns_of
+        from slam_observer_ros.cli.console import columns_of
 
     console = Console(highlight=False, markup=False)
     columns = list(zip(headings, *rows, strict=True))
@@ -181,3 +183,23 @@ def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[s
     for table in tables:
         headings, *lines = zip(*(columns[number] for number in table), strict=True)
         console.print(columns_of(title, headings, [line for line in lines if any(line[1:])]))
+
+
+def table_of(title: str, rows: Mapping[str, str]) -> Table:
+    """Return a table of names and values; a narrow terminal folds it and shortens nothing."""
+    table = Table(title=title, title_justify='left', show_header=False)
+    for _ in ('name', 'value'):
+        table.add_column(overflow='fold')
+    for name, value in rows.items():
+        table.add_row(name, value)
+    return table
+
+
+def columns_of(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table with a line for each of ``rows``, whose first entry is its name."""
+    table = Table(title=title, title_justify='left')
+    for number, heading in enumerate(headings):
+        table.add_column(heading, overflow='fold', justify='right' if number else 'left')
+    for row in rows:
+        table.add_row(*row)
+    return table

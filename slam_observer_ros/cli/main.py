@@ -17,6 +17,7 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
+    from slam_observer_ros import __version__
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
     from slam_observer_ros.cli.shell import complete, typed_words
     from slam_observer_ros.common.errors import (
@@ -26,7 +27,6 @@ with leaving_at_once():
         SlamObserverError,
     )
     from slam_observer_ros.common.threads import use_one_thread
-    from slam_observer_ros.common.version import VERSION
     from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2
@@ -95,7 +95,7 @@ def make_parser(arguments: Sequence[str]) -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument('--version', action='version', version=f'{PROGRAM} {VERSION}')
+    parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     given = next((word for word in arguments if not word.startswith('-')), None)
     for name, (module, help_text) in COMMANDS.items():

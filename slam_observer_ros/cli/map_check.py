@@ -79,7 +79,7 @@ def _run(args: argparse.Namespace) -> None:
     print_table(str(args.file), values)
     if args.plot:
         # matplotlib takes half a second to import.
-        from slam_observer_ros.evaluation.plots.map_plot import plot_map_check
+        from slam_observer_ros.evaluation.map_plot import plot_map_check
 
         too_few = looks.fitting == 0
         places = looks.poses[:, :3, 3]

@@ -12,8 +12,8 @@ import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
 from slam_observer_ros.estimator.checks import (
     check_event,

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.messages.poses import PoseMessage

@@ -6,10 +6,9 @@ from collections import deque
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.observer.gauge import anchor, JITTER_M2
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 

@@ -13,8 +13,8 @@ import struct
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import ENCAPSULATION_BYTES, encode_string
 

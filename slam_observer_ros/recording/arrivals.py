@@ -6,8 +6,8 @@ from array import array
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.common.units import to_s
 
 MOST_SAMPLES = 8192
 """How many delays are kept; then every second one is left out, of those to come as well."""

@@ -8,13 +8,13 @@ import logging
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.metrics import (
+    ConfigurationError,
     landmark_errors,
     trajectory_errors,
     TrajectoryErrors,

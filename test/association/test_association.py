@@ -29,7 +29,7 @@ from slam_observer_ros.association.landmark_index import LandmarkIndex
 from slam_observer_ros.association.new_landmarks import NewLandmarks
 from slam_observer_ros.association.visibility import FieldOfView, Visibility
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,

@@ -20,9 +20,9 @@ from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import PLANAR
 from slam_observer_ros.geometry.matrices import diagonal_blocks
+from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map import export, map_correlations
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map

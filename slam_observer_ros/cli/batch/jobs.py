@@ -13,6 +13,7 @@ import json
 from pathlib import Path
 import re
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import kept_warnings
 from slam_observer_ros.cli.options import parse_value
 from slam_observer_ros.cli.replay.files import write_report_of
@@ -21,7 +22,6 @@ from slam_observer_ros.cli.replay.run import replayed
 from slam_observer_ros.cli.replay.summary import as_json, identity, summary_rows
 from slam_observer_ros.common.errors import shown, UsageError
 from slam_observer_ros.common.files import not_special
-from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.trajectory import write_tum
 from slam_observer_ros.known_map.map_file import map_files
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -119,7 +119,7 @@ def make_job(request: ReplayRequest, sha256: str, point: Point) -> Job:
     map_bytes = b''.join(not_special(path).read_bytes() for path in maps)
     depends_on = {
         'recording': sha256,
-        'version': VERSION,
+        'version': __version__,
         'settings': _changed(request.settings),
         'inputs': _changed(request.inputs),
         'topics': dataclasses.astuple(request.topics),
@@ -149,12 +149,12 @@ class Work:
     out: Path
     writes_reports: bool
     writes_trajectories: bool
-    version: str = VERSION
+    version: str = __version__
 
     def __call__(self, job: Job) -> dict[str, object]:
         """Do a run, write its files, and return its line of the log."""
-        if self.version != VERSION:
-            raise UsageError(f'this worker has version {VERSION}, the batch {self.version}')
+        if self.version != __version__:
+            raise UsageError(f'this worker has version {__version__}, the batch {self.version}')
         report = self._file(REPORTS, job, '.html') if self.writes_reports else None
         tum = self._file(TRAJECTORIES, job, '.tum') if self.writes_trajectories else None
         records = Records(poses=tum is not None, whole_run=report is not None)

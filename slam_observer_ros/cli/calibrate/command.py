@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.calibrate.finder import Finder, growth
 from slam_observer_ros.cli.calibrate.stated import (
     depth_text,
@@ -48,7 +49,6 @@ from slam_observer_ros.cli.tune.tuned_file import (
 from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
 from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
@@ -192,7 +192,7 @@ def _print(
             {
                 'recording': str(args.recording),
                 'recording_sha256': material.sha256,
-                'version': VERSION,
+                'version': __version__,
                 'map': None if args.survey is None else str(args.survey),
                 'calibration': {
                     part.name: asdict(part)
@@ -249,7 +249,7 @@ def _write(
     held_out = [str(path) for path in args.hold_out] or ['the last third']
     where = 'the map being made' if args.survey is None else f'the map {args.survey.name}'
     head = [
-        f'By slam-observer calibrate {VERSION} from',
+        f'By slam-observer calibrate {__version__} from',
         f'  {material.path.name} (SHA-256 {material.sha256}) in {where}',
         'log likelihood, gain: {:.1f} ± {:.1f}'.format(*gain),
         *judged_lines(held_out, verdict),

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import Value

@@ -16,7 +16,7 @@ from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, of_points, scaled
 from slam_observer_ros.cli.tune.search import search_noise
 from slam_observer_ros.cli.tune.verdict import judge, Judged, SURE
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent

@@ -203,7 +203,7 @@ def _draw_figures(args: argparse.Namespace, outcome: ReplayOutcome, directory: P
 
 def _draw(outcome: ReplayOutcome, directory: Path, suffix: str) -> None:
     """Draw the figures into a directory that is there, as files of one kind."""
-    from slam_observer_ros.evaluation.plots.replay_plots import plot_residuals
+    from slam_observer_ros.evaluation.replay_plots import plot_residuals
 
     _draw_map(outcome, directory / f'map.{suffix}')
     _draw_errors(outcome, directory / f'errors.{suffix}')
@@ -218,7 +218,7 @@ def _draw(outcome: ReplayOutcome, directory: Path, suffix: str) -> None:
 
 
 def _draw_map(outcome: ReplayOutcome, path: Path) -> None:
-    from slam_observer_ros.evaluation.plots.map_plot import plot_map
+    from slam_observer_ros.evaluation.map_plot import plot_map
 
     result, truth, smoothed = outcome.result, outcome.truth, outcome.smoothed
     has_errors = outcome.trajectory_errors is not None
@@ -253,7 +253,7 @@ def _landmark_covariances(result: Replay) -> FloatArray | None:
 
 def _draw_errors(outcome: ReplayOutcome, path: Path) -> None:
     """Draw the errors of what is written, unless the truth covers nothing of it."""
-    from slam_observer_ros.evaluation.plots.replay_plots import plot_errors
+    from slam_observer_ros.evaluation.replay_plots import plot_errors
 
     result, errors = outcome.result, outcome.trajectory_errors
     if errors is None:

@@ -8,11 +8,11 @@ from dataclasses import asdict
 import hashlib
 from pathlib import Path
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.figures import ACCURACY_ROWS, figure_text
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
 from slam_observer_ros.common.files import not_special
-from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.opening import files_of
@@ -35,7 +35,7 @@ def identity(recording: Path, sha256: str, outcome: ReplayOutcome) -> dict[str, 
     return {
         'recording': str(recording),
         'recording_sha256': sha256,
-        'version': VERSION,
+        'version': __version__,
         'settings': {name: getattr(settings, name) for name in changed_names(settings)},
         'warnings': list(outcome.warnings),
     }

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind
 from slam_observer_ros.cli.tune.verdict import Verdict
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
-from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import value_text
 from slam_observer_ros.settings.parameter_table import Value
@@ -64,7 +64,7 @@ def write_tuned(
 ) -> None:
     """Write what was given, and what was tuned in its place; an OutputError if that fails."""
     head = [
-        f'Noise by slam-observer tune {VERSION}: maximum likelihood of the innovations of',
+        f'Noise by slam-observer tune {__version__}: maximum likelihood of the innovations of',
         *(f'  {name}' for name in trained_on),
         *judged_lines(held_out, verdict),
         'Intervals are of 95 %, by the curvature of the likelihood, as if all innovations were',

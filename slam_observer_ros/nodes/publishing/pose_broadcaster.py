@@ -9,8 +9,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.state_messages import encode_transform

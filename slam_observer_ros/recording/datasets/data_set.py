@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
+from slam_observer_ros.evaluation.run_record import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 

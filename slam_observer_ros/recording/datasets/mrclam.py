@@ -15,7 +15,7 @@ import numpy as np
 
 from slam_observer_ros.common.errors import DataSetError
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.truth import LandmarkTruth
+from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.datasets.data_set import DataSet

@@ -1,8 +1,31 @@
-"""Stamps that jump: a stray one is an error, several that agree are a pause or a jump."""
+"""Time: int nanoseconds inside, float seconds for people and physics; and stamps that jump."""
 
 from __future__ import annotations
 
-from slam_observer_ros.common.types import IntArray
+from typing import overload
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+
+NANOSECONDS_PER_SECOND = 1_000_000_000
+
+
+def to_ns(seconds: float) -> int:
+    """Return a time in nanoseconds, rounded."""
+    return round(seconds * NANOSECONDS_PER_SECOND)
+
+
+@overload
+def to_s(nanoseconds: int) -> float: ...
+
+
+@overload
+def to_s(nanoseconds: IntArray) -> FloatArray: ...
+
+
+def to_s(nanoseconds: int | IntArray) -> float | FloatArray:
+    """Return a time, or an array (...,) of times, in seconds."""
+    return nanoseconds / NANOSECONDS_PER_SECOND
+
 
 AGREEING_STAMPS = 5
 """How many stamps in a row must agree before a pause or a jump of the clock is believed."""

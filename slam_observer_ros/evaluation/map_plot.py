@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.evaluation.ellipses import CHI_SQUARE_95, outlines
-from slam_observer_ros.evaluation.metrics import trajectory_errors
-from slam_observer_ros.evaluation.plots.drawing import (
+from slam_observer_ros.evaluation.consistency import CHI_SQUARE_95, outlines
+from slam_observer_ros.evaluation.drawing import (
     BLACK,
     ELLIPSES,
     END,
     GREEN,
     is_flat,
+    label_points,
     LANDMARKS,
     legend_below,
     LINKS,
@@ -33,9 +33,9 @@ from slam_observer_ros.evaluation.plots.drawing import (
     TRUE_LANDMARKS,
     TRUE_PATH,
 )
-from slam_observer_ros.evaluation.plots.labels import label_points
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 

@@ -11,8 +11,7 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.metrics import Decay
-from slam_observer_ros.evaluation.plots.drawing import (
+from slam_observer_ros.evaluation.drawing import (
     BLACK,
     END,
     is_flat,
@@ -28,9 +27,10 @@ from slam_observer_ros.evaluation.plots.drawing import (
     TRUE_LANDMARKS,
     TRUE_PATH,
 )
+from slam_observer_ros.evaluation.metrics import Decay
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.geometry.se3 import rigid_alignment
 
 
 @mpl.rc_context(STYLE)

@@ -12,12 +12,10 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from slam_observer_ros.common.digits import significant
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import average_nees_band, NeesOverTime
-from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.evaluation.plots.drawing import (
+from slam_observer_ros.evaluation.drawing import (
     BLACK,
     BLUE,
     GREEN,
@@ -30,6 +28,7 @@ from slam_observer_ros.evaluation.plots.drawing import (
     save,
     STYLE,
 )
+from slam_observer_ros.evaluation.metrics import ConfigurationError, TrajectoryErrors
 from slam_observer_ros.evaluation.run_record import Innovations
 from slam_observer_ros.settings.estimator_settings import Settings
 
