@@ -25,8 +25,8 @@ from slam_observer_ros.evaluation.drawing import PALE_BLUE, RED, STYLE
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.datasets.data_set import DataSet
-from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.recording.mrclam import load_mrclam
+from slam_observer_ros.recording.writer import DataSet
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters

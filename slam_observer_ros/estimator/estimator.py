@@ -34,10 +34,10 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
+from slam_observer_ros.known_map.merging import map_of
 from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings

@@ -19,7 +19,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import MAX_ID, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import encode_string
-from slam_observer_ros.messages.cloud_fields import (
+from slam_observer_ros.messages.clouds import (
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,
     ID_NAME,

@@ -28,8 +28,7 @@ from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock
 from slam_observer_ros.messages.registry import BlockDecoder
-from slam_observer_ros.recording.arrivals import Arrivals
-from slam_observer_ros.recording.contents import Contents
+from slam_observer_ros.recording.contents import Arrivals, Contents
 from slam_observer_ros.recording.decoding import (
     block_decoder,
     Decode,

@@ -10,14 +10,14 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
-from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
-from slam_observer_ros.messages.poses import TRANSFORMS
-from slam_observer_ros.messages.state_messages import (
+from slam_observer_ros.messages.estimate_messages import (
     encode_transform,
+    EstimateMessages,
+    PATH_SPACING_NS,
     StateMessages,
     uncertain_pose,
 )
-from slam_observer_ros.messages.velocities import ODOMETRY
+from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.health import diagnostics
 

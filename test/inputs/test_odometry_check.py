@@ -7,7 +7,7 @@ import pytest
 
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.inputs.odometry_check import OdometryCheck
+from slam_observer_ros.inputs.odometry import OdometryCheck
 from slam_observer_ros.messages.poses import PoseMessage
 
 PERIOD_NS = 20_000_000

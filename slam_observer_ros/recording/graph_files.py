@@ -22,7 +22,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import MAX_ID, ObservationEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.datasets.data_set import DataSet
+from slam_observer_ros.recording.writer import DataSet
 
 START_NS = NANOSECONDS_PER_SECOND
 """Stamp of the first pose; zero stands for an unknown time."""

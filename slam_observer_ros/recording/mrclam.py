@@ -18,7 +18,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.datasets.data_set import DataSet
+from slam_observer_ros.recording.writer import DataSet
 
 FIRST_LANDMARK_SUBJECT = 6
 """Subjects 1 to 5 are the robots."""

@@ -17,7 +17,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.datasets.data_set import DataSet
+from slam_observer_ros.recording.writer import DataSet
 
 EPOCH_NS = 1_256_566_448 * NANOSECONDS_PER_SECOND
 """Time zero of the recording, which states none: when its file was made, 2009-10-26."""
