@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_limits
 import worlds
 from worlds import drive, Loop, simulated_settings, World
 
-from slam_observer_ros.cli.calibrate.finder import Finder
-from slam_observer_ros.cli.tune.material import Material
+from slam_observer_ros.cli.calibration_finder import Finder
+from slam_observer_ros.cli.held_out import Material
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator

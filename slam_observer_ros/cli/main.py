@@ -39,13 +39,13 @@ COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
     'map': ('map', 'make a map file of a map of another program, or check one'),
-    'replay': ('replay.command', 'run a recording through the observer'),
-    'calibrate': ('calibrate.command', 'find how sensor and odometry err, by a drive'),
-    'tune': ('tune.command', 'find the noise figures that a recording shows'),
+    'replay': ('replay', 'run a recording through the observer'),
+    'calibrate': ('calibrate', 'find how sensor and odometry err, by a drive'),
+    'tune': ('tune', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),
     'doctor': ('doctor', 'say what is installed, and what a node would hear'),
     'compare': ('compare', 'put runs, gains and TUM files on one recording side by side'),
-    'batch': ('batch.command', 'run many recordings with many settings'),
+    'batch': ('batch', 'run many recordings with many settings'),
 }
 """The module of each command, and what it does; only the one that is given is imported."""
 

@@ -6,6 +6,7 @@ rosbag2 compresses with zstd: each message, or each file as a whole.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+import hashlib
 from itertools import islice
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -31,6 +32,8 @@ FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
 MAX_METADATA_BYTES = 10_000_000
 """Bytes of a metadata.yaml that is read; that of a thousand files has a tenth of them."""
 
+
+_BLOCK_BYTES = 1 << 20
 
 _NONE_LEFT = 'no whole message is left'
 
@@ -304,3 +307,13 @@ def _decompressed(data: bytes) -> bytes:
         return zstandard.ZstdDecompressor().decompressobj().decompress(data)
     except zstandard.ZstdError:
         return b''
+
+
+def sha256_of(recording: Path) -> str:
+    """Return the SHA-256 of a recording's files, one after the other, as hexadecimal digits."""
+    digest = hashlib.sha256()
+    for file in files_of(recording):
+        with not_special(file).open('rb') as opened:
+            while block := opened.read(_BLOCK_BYTES):
+                digest.update(block)
+    return digest.hexdigest()

@@ -15,7 +15,7 @@ from slam_observer_ros.evaluation.metrics import Decay, fit_decay
 from slam_observer_ros.evaluation.run_record import PoseTruth
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.observer.innovation import lyapunov
-from slam_observer_ros.runs.recorder import PoseSamples
+from slam_observer_ros.runs.sampling import PoseSamples
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation
 

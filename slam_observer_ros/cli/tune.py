@@ -7,28 +7,40 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
+from slam_observer_ros.cli.held_out import (
+    add_material_options,
+    check_seen,
+    HELD_OUT_SHARE,
+    judge,
+    Judged,
+    judged_lines,
+    Material,
+    read_material,
+    Verdict,
+    verdict_lines,
+)
+from slam_observer_ros.cli.noise_tuning import (
+    certainty,
+    Found,
+    kinds_of,
+    NoiseKind,
+    rounded,
+    scaled,
+    search_noise,
+)
 from slam_observer_ros.cli.options import named_path, read_given
 from slam_observer_ros.cli.outputs import (
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay.request import read_request, ReplayRequest
-from slam_observer_ros.cli.tune.material import (
-    add_material_options,
-    check_seen,
-    HELD_OUT_SHARE,
-    Material,
-    read_material,
-)
-from slam_observer_ros.cli.tune.noise_kinds import kinds_of, NoiseKind, scaled
-from slam_observer_ros.cli.tune.search import Found, search_noise
-from slam_observer_ros.cli.tune.tuned_file import certainty, rounded, verdict_lines, write_tuned
-from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
+from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
 from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_file import write_found
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -77,10 +89,8 @@ def run(args: argparse.Namespace) -> None:
     if verdict.objection:
         raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
     if args.out is not None:
-        texts = [(kind, text) for kind, text in zip(kinds, _certainties(found), strict=True)]
-        held_out = [str(path) for path in args.hold_out] or ['the last third of each']
-        trained = [f'{one.path.name} (SHA-256 {one.sha256})' for one in trained_on]
-        write_tuned(args.out, given.values, tuned, texts, trained, held_out, verdict)
+        head = _head(trained_on, args.hold_out, verdict)
+        write_found(args.out, head, given.values, _groups(tuned, kinds, found))
 
 
 def _rounded(settings: Settings, kinds: Sequence[NoiseKind]) -> Settings:
@@ -108,6 +118,30 @@ def _verdict(
         after.append(material.judged(tuned))
     check_seen([*before, *after])
     return judge(before, after)
+
+
+def _head(trained_on: Sequence[Material], held_out: Sequence[Path], verdict: Verdict) -> list[str]:
+    """Return what the parameter file says first."""
+    return [
+        f'Noise by slam-observer tune {__version__}: maximum likelihood of the innovations of',
+        *(f'  {one.path.name} (SHA-256 {one.sha256})' for one in trained_on),
+        *judged_lines([str(path) for path in held_out] or ['the last third of each'], verdict),
+        'Intervals are of 95 %, by the curvature of the likelihood, as if all innovations were',
+        'independent: errors that last make them too narrow.',
+    ]
+
+
+def _groups(
+    tuned: Settings, kinds: Sequence[NoiseKind], found: Found
+) -> list[tuple[str, dict[str, object]]]:
+    """Return the parameters that were tuned, by kind, each with a comment."""
+    return [
+        (
+            f'{kind.name}: {text} what it was',
+            {name: getattr(tuned, name) for name in kind.parameters},
+        )
+        for kind, text in zip(kinds, _certainties(found), strict=True)
+    ]
 
 
 def _certainties(found: Found) -> list[str]:

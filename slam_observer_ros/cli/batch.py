@@ -10,26 +10,24 @@ import logging
 import os
 from pathlib import Path
 
-from slam_observer_ros.cli.batch.index import INDEX, SCORES, write_index
-from slam_observer_ros.cli.batch.jobs import (
+from slam_observer_ros.cli.batch_index import INDEX, SCORES, write_index
+from slam_observer_ros.cli.batch_jobs import (
     find_recordings,
     grid_points,
     Job,
+    Line,
+    log_name,
     make_job,
+    opened_log,
     part_of,
+    read_logs,
     REPORTS,
     shard_of,
     TRAJECTORIES,
     Work,
-)
-from slam_observer_ros.cli.batch.pool import cluster_pool, local_pool, Pool
-from slam_observer_ros.cli.batch.run_log import (
-    Line,
-    log_name,
-    opened_log,
-    read_logs,
     write_failures,
 )
+from slam_observer_ros.cli.batch_pool import cluster_pool, local_pool, Pool
 from slam_observer_ros.cli.console import (
     muted_warnings,
     print_json,
@@ -39,10 +37,10 @@ from slam_observer_ros.cli.console import (
 )
 from slam_observer_ros.cli.options import add_settings_options, named, named_path, read_given
 from slam_observer_ros.cli.outputs import check_directory
-from slam_observer_ros.cli.replay.request import add_run_options, read_request
-from slam_observer_ros.cli.replay.summary import sha256_of
+from slam_observer_ros.cli.replay_request import add_run_options, read_request
 from slam_observer_ros.common.errors import IncompleteError, OutputError
 from slam_observer_ros.common.files import destination
+from slam_observer_ros.recording.opening import sha256_of
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)

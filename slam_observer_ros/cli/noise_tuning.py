@@ -1,19 +1,98 @@
-"""The most likely factors, and how sure they are."""
+"""The most likely noise figures, and nothing else: a factor for each kind of error.
+
+Figures of one kind keep their proportions: how much of an error grows with the speed or with the
+range, and along which axis it is, a recording seldom shows. One that is zero stays zero.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 import numpy as np
 from scipy import optimize
 
-from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, scaled
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.runs.likelihood import Likelihood
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_table import table, Value
+
+_ROWS = {row.name: row for row in table(Settings)}
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseKind:
+    """A kind of error, and the parameters that say how large it is."""
+
+    name: str
+    parameters: tuple[str, ...]
+
+
+_OF_MOTION = (
+    NoiseKind('turning', ('angular_velocity_noise', 'angular_scale_noise')),
+    NoiseKind('driving', ('linear_velocity_noise', 'linear_scale_noise')),
+)
+_OF_POINTS = {
+    'range_bearing': (
+        NoiseKind('range', ('range_noise', 'range_scale_noise')),
+        NoiseKind('bearing', ('bearing_noise',)),
+    ),
+    'fiducial': (NoiseKind('pixels', ('pixel_noise',)),),
+    'cartesian': (NoiseKind('points', ('point_noise',)),),
+    'stereo': (
+        NoiseKind('pixels', ('pixel_noise',)),
+        NoiseKind('disparity', ('disparity_noise',)),
+    ),
+}
+
+
+def kinds_of(settings: Settings) -> list[NoiseKind]:
+    """Return the kinds of error that settings state, each with its figures that are not zero."""
+    return [*of_motion(settings), *of_points(settings)]
+
+
+def of_motion(settings: Settings) -> list[NoiseKind]:
+    """Return those of velocities."""
+    return _stated(_OF_MOTION, settings)
+
+
+def of_points(settings: Settings) -> list[NoiseKind]:
+    """Return those of points."""
+    return _stated(_OF_POINTS[settings.observation_model], settings)
+
+
+def _stated(possible: Sequence[NoiseKind], settings: Settings) -> list[NoiseKind]:
+    kinds = []
+    for kind in possible:
+        stated = tuple(name for name in kind.parameters if np.any(getattr(settings, name)))
+        if stated:
+            kinds.append(NoiseKind(kind.name, stated))
+    return kinds
+
+
+def scaled(
+    settings: Settings, kinds: Sequence[NoiseKind], log_factors: Sequence[float]
+) -> Settings:
+    """Return settings whose figures of each kind have grown by a factor, given as its logarithm.
+
+    None gets smaller or larger than its parameter may be.
+    """
+    values: dict[str, Any] = {}
+    for kind, log_factor in zip(kinds, log_factors, strict=True):
+        for name in kind.parameters:
+            values[name] = _scaled(name, getattr(settings, name), math.exp(log_factor))
+    return replace(settings, **values)
+
+
+def _scaled(name: str, value: Value, factor: float) -> Value:
+    row = _ROWS[name]
+    entries = value if isinstance(value, tuple) else (float(value),)
+    within = tuple(min(max(factor * entry, row.minimum), row.maximum) for entry in entries)
+    return within if isinstance(value, tuple) else within[0]
+
 
 LARGEST = math.log(32.0)
 """Logarithm of the factor by which a figure changes at most."""
@@ -30,6 +109,9 @@ TOLERANCE = 0.03
 
 NO_EFFECT = 1e-6
 """Change of the log likelihood below which a factor has none."""
+
+DIGITS = 3
+"""Significant digits of a noise figure; it is seldom known to so many."""
 
 Objective = Callable[[FloatArray], float]
 
@@ -141,3 +223,23 @@ def search_noise(
     return effective, most_likely(
         remembered(lambda x: log_likelihood(effective, x)), len(effective)
     )
+
+
+def rounded(value: Value) -> Value:
+    """Return a figure, or a vector of them, as it is written."""
+    if isinstance(value, tuple):
+        return tuple(_rounded(entry) for entry in value)
+    return _rounded(float(value))
+
+
+def _rounded(value: float) -> float:
+    return float(f'{value:.{DIGITS}g}')
+
+
+def certainty(log_factor: float, deviation: float) -> str:
+    """Return a factor and its interval of 95 % as text."""
+    factor = math.exp(log_factor)
+    if not math.isfinite(deviation):
+        return f'× {factor:.2g}, of which the recording says little'
+    low, high = (math.exp(log_factor + sign * 2.0 * deviation) for sign in (-1, 1))
+    return f'× {factor:.2g} ({low:.2g} to {high:.2g})'

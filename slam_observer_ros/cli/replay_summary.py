@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import asdict
-import hashlib
 from pathlib import Path
 
 from slam_observer_ros import __version__
-from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.figures import ACCURACY_ROWS, figure_text
-from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.common.files import not_special
+from slam_observer_ros.cli.replay_outcome import ReplayOutcome
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.recording.opening import files_of
+from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, figure_text
 from slam_observer_ros.runs.input_health import list_dropped
 from slam_observer_ros.runs.replay import Replay
 from slam_observer_ros.settings.parameter_table import changed_names
-
-_BLOCK_BYTES = 1 << 20
 
 NEARLY_ALL = 0.99
 """Share of the trajectory that the truth covers, up to which it is printed."""
@@ -39,16 +32,6 @@ def identity(recording: Path, sha256: str, outcome: ReplayOutcome) -> dict[str, 
         'settings': {name: getattr(settings, name) for name in changed_names(settings)},
         'warnings': list(outcome.warnings),
     }
-
-
-def sha256_of(recording: Path) -> str:
-    """Return the SHA-256 of a recording's files, one after the other, as hexadecimal digits."""
-    digest = hashlib.sha256()
-    for file in files_of(recording):
-        with not_special(file).open('rb') as opened:
-            while block := opened.read(_BLOCK_BYTES):
-                digest.update(block)
-    return digest.hexdigest()
 
 
 def as_json(outcome: ReplayOutcome) -> dict[str, object]:
@@ -93,12 +76,6 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
 
 def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
     return None if errors is None else errors.ate_rmse_m
-
-
-def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str, Path]) -> None:
-    """Print the figures as a table, and what was written where."""
-    rows = summary_rows(outcome) | {name: str(path) for name, path in written.items()}
-    print_table(str(recording), rows)
 
 
 def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:

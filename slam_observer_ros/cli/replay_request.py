@@ -19,6 +19,8 @@ from slam_observer_ros.settings.message_types import short_names
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import from_parameters, table, Value
 
+logger = logging.getLogger(__name__)
+
 _ROWS = {row.name: row for row in table(InputSettings)}
 INPUT_NAMES = frozenset(_ROWS)
 """Parameters of the node that a replay knows, too."""
@@ -29,8 +31,6 @@ INSTEAD = {
     'velocity_type': '--velocity-topic',
 }
 """Options of a replay for what the node does by these parameters."""
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ from slam_observer_ros.cli.outputs import (
     filled_directory,
     recording_path,
 )
-from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.cli.replay.request import Records
+from slam_observer_ros.cli.replay_outcome import ReplayOutcome
+from slam_observer_ros.cli.replay_request import Records
 from slam_observer_ros.common.errors import EvaluationError, SlamObserverError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import nees_over_time, shape_covariances

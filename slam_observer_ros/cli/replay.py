@@ -5,26 +5,21 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from slam_observer_ros.cli.console import kept_warnings, print_json
+from slam_observer_ros.cli.console import kept_warnings, print_json, print_table
 from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
 from slam_observer_ros.cli.outputs import add_force_option
-from slam_observer_ros.cli.replay.files import (
+from slam_observer_ros.cli.replay_files import (
     add_output_options,
     check_files,
     records_of,
     write_files,
 )
-from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.cli.replay.request import add_run_options, read_request, warn_of_unused
-from slam_observer_ros.cli.replay.run import replayed
-from slam_observer_ros.cli.replay.summary import (
-    as_json,
-    identity,
-    print_summary,
-    sha256_of,
-    summary_rows,
-)
+from slam_observer_ros.cli.replay_outcome import ReplayOutcome
+from slam_observer_ros.cli.replay_request import add_run_options, read_request, warn_of_unused
+from slam_observer_ros.cli.replay_run import replayed
+from slam_observer_ros.cli.replay_summary import as_json, identity, summary_rows
 from slam_observer_ros.common.errors import LossError, OutputError
+from slam_observer_ros.recording.opening import sha256_of
 from slam_observer_ros.settings.input_settings import InputSettings
 
 
@@ -66,12 +61,14 @@ def run(args: argparse.Namespace) -> None:
 
 def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
     """Write and print all that can be, and only then say what could not be written."""
-    written, errors = write_files(args, outcome, map_frame, summary_rows(outcome))
+    rows = summary_rows(outcome)
+    written, errors = write_files(args, outcome, map_frame, rows)
     if args.json:
         sha256 = sha256_of(args.recording)
         print_json(identity(args.recording, sha256, outcome) | as_json(outcome))
     else:
-        print_summary(args.recording, outcome, written)
+        rows |= {name: str(path) for name, path in written.items()}
+        print_table(str(args.recording), rows)
     if errors:
         raise OutputError('; '.join(errors))
     if args.strict and any(outcome.lost.values()):

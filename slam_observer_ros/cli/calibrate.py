@@ -8,8 +8,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from slam_observer_ros import __version__
-from slam_observer_ros.cli.calibrate.finder import Finder, growth
-from slam_observer_ros.cli.calibrate.stated import (
+from slam_observer_ros.cli.calibration_finder import Finder, growth
+from slam_observer_ros.cli.calibration_stated import (
     depth_text,
     Found,
     is_off,
@@ -26,27 +26,26 @@ from slam_observer_ros.cli.console import (
     print_table,
     shown_steps,
 )
+from slam_observer_ros.cli.held_out import (
+    add_material_options,
+    check_seen,
+    HELD_OUT_SHARE,
+    judge,
+    Judged,
+    judged_lines,
+    Material,
+    read_material,
+    Verdict,
+    verdict_lines,
+)
+from slam_observer_ros.cli.noise_tuning import certainty
 from slam_observer_ros.cli.options import Given, named_path, read_given
 from slam_observer_ros.cli.outputs import (
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay.request import read_request, ReplayRequest
-from slam_observer_ros.cli.replay.run import select_inputs
-from slam_observer_ros.cli.tune.material import (
-    add_material_options,
-    check_seen,
-    HELD_OUT_SHARE,
-    Material,
-    read_material,
-)
-from slam_observer_ros.cli.tune.tuned_file import (
-    certainty,
-    judged_lines,
-    verdict_lines,
-    write_found,
-)
-from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
+from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
+from slam_observer_ros.cli.replay_run import select_inputs
 from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent
@@ -57,6 +56,7 @@ from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.runs.health import of_mounting, of_noise
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_file import write_found
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

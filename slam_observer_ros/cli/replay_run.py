@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.cli.console import show_progress
-from slam_observer_ros.cli.replay.outcome import judged, outcome_of, ReplayOutcome, with_smoothed
-from slam_observer_ros.cli.replay.request import Records, ReplayRequest
+from slam_observer_ros.cli.replay_outcome import judged, outcome_of, ReplayOutcome, with_smoothed
+from slam_observer_ros.cli.replay_request import Records, ReplayRequest
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.estimates import UNUSED_POINTS
