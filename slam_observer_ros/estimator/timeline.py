@@ -9,8 +9,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityBlock
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities

@@ -79,7 +79,7 @@ class RangeErrors:
             self._compare()
 
     def _compare(self) -> None:
-        """Take the ranges of several observations at once: one by one costs three times as much."""
+        """Take the ranges of several observations at once, as one by one costs three times that."""
         none = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
         columns = zip(none, *self._uncompared, strict=True)
         shown, arms, cosine = (np.concatenate(parts) for parts in columns)
@@ -115,7 +115,7 @@ class RangeErrors:
 
 
 def _find(wanted: IntArray, ids: IntArray) -> tuple[IntArray, BoolArray]:
-    """Return at which rows of ``ids`` (n,), n > 0, the wanted ones (m,) are, and whether they are."""
+    """Return at which rows of ``ids`` (n,), n > 0, wanted ones (m,) are, and whether they are."""
     order = np.argsort(ids)
     rows = order.take(ids[order].searchsorted(wanted), mode='clip')
     return rows, ids[rows] == wanted

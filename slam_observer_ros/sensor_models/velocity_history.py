@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.events import AngularVelocityEvent, flatten_velocities, VelocityBlock
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
 
