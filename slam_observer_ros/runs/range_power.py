@@ -79,7 +79,7 @@ class RangeErrors:
             self._compare()
 
     def _compare(self) -> None:
-        """Take the ranges of several observations at once, as one by one costs three times that."""
+        """Take the ranges of several observations at once: one by one costs more."""
         none = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
         columns = zip(none, *self._uncompared, strict=True)
         shown, arms, cosine = (np.concatenate(parts) for parts in columns)
