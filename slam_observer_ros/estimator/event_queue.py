@@ -331,7 +331,7 @@ def _received_ns(event: Queued) -> int | None:
 
 
 def _keys(event: Queued) -> list[Key]:
-    """Return what tells an event, or each of several, from all others, in order."""
+    """Return what no other event has; of several velocities what each has, in order."""
     if isinstance(event, VelocityBlock):
         return list(zip(event.stamps_ns.tolist(), repeat(False), repeat(_LINEAR)))
     if isinstance(event, AngularVelocityEvent):
