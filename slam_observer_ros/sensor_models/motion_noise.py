@@ -120,7 +120,6 @@ class MotionNoise:
         variances = motion_variances(
             held.body_velocities, held.dt_s, held.before_s, held.usual_s, self.figures
         )
-        factors = self.factors.applied.repeat(3)
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         # In a gap the robot may do anything that is allowed.
@@ -132,6 +131,7 @@ class MotionNoise:
         # however many motions that was cut into. Of angular and linear part one may have none.
         if some_are_stated:
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
+            factors = self.factors.applied.repeat(3)
             grown_s = np.repeat(np.sqrt(squared), 3, axis=1) * np.sqrt(factors)
             stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
