@@ -102,11 +102,11 @@ def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEven
         return event, rows
     is_new = rows < 0
     state.forget(_rows_to_forget(state, matched), 'forgotten_landmark')
-    _initialise(state, event.select(is_new), matched.covariances[is_new])
+    initialise(state, event.select(is_new), matched.covariances[is_new])
     return mapped(state, event)
 
 
-def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> None:
+def initialise(state: State, event: ObservationEvent, noise: FloatArray) -> None:
     """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
     limit, new = state.settings.max_landmarks, len(event.ids)
     m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
