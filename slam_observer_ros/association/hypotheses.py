@@ -355,9 +355,7 @@ class Hypotheses:
         return self._next_id + np.arange(m)
 
 
-def _observed(
-    state: State, event: ObservationEvent, is_weighed: bool = False
-) -> Outcome | None:
+def _observed(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
     """Let a state use an observation, or a part of it, as usual; None where it is not."""
     outcome = usual.observe(state, event, is_weighed)
     return in_parts.observe(state, event, is_weighed) if outcome is None else outcome

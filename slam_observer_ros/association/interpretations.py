@@ -68,8 +68,8 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    ``state`` is that at its instant, ``index`` that of its landmarks. Points taken for landmarks not seen before get
-    ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
+    ``state`` is that at its instant, ``index`` that of its landmarks. Points taken for landmarks
+    not seen before get ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """

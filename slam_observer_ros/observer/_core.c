@@ -1234,23 +1234,13 @@ static void step_factors(const Factors *factors, const double g[2], const double
     }
 }
 
-/* What these residuals say of the noise of the motion; 0 if some are to be left out of that.
- * ``work``: M (M + p + 1). */
+/* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms has
+ * it, which may be less than is applied; 0 if that is indefinite. ``work``: M (M + p + 1). */
 static int learn(const Estimate *x, const Factors *factors, double gate, const Observed *out,
                  const Residuals *res, double *work, double logs[2], double information[4]) {
-    long M = res->M;
-    int p = x->p, k = res->k;
-    double N[72], change[36] = {0.0}, block[9], u[6] = {0.0}, G[36] = {0.0}, g[2], F[4];
-    double *L = work, *Y = work + M * M, *z = Y + M * p;
-    /* C at the middle between where landmarks are expected and seen. */
-    for (long i = 0; i < res->m; i++) {
-        double middle[3];
-        for (int b = 0; b < 3; b++)
-            middle[b] = res->points[3 * i + b] + 0.5 * out->r[3 * i + b];
-        output_matrix(x, middle, Y + k * i * p, p);
-    }
-    /* As the likelihood at the logarithms has it, which may be less than is applied. */
-    memcpy(L, res->S, (size_t)(M * M) * sizeof(double));
+    int p = x->p, k = res->k, at[3 * MAX_SEEN], kept[3 * MAX_SEEN];
+    double N[72], change[36] = {0.0}, u[6] = {0.0}, G[36] = {0.0}, g[2], F[4];
+    double *L = work, *Y = L + res->M * res->M, *z = Y + res->M * p, squared;
     for (int j = 0; j < 2; j++) {
         double ratio = exp(factors->logs[j]) / factors->applied[j];
         for (int e = 0; e < p * p; e++) {
@@ -1258,28 +1248,45 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
             change[e] += N[p * p * j + e] - factors->shares[p * p * j + e];
         }
     }
-    for (long i = 0; i < M; i++) {
-        double half[6] = {0.0};
-        for (int s = 0; s < p; s++)
-            for (int t = 0; t < p; t++)
-                half[t] += Y[i * p + s] * change[p * s + t];
-        for (long j = 0; j < M; j++)
-            for (int t = 0; t < p; t++)
-                L[i * M + j] += half[t] * Y[j * p + t];
+    long M = res->M, passed; /* entries ``at`` of the residuals: at first all */
+    for (int i = 0; i < M; i++)
+        at[i] = i;
+    for (;;) {
+        for (long i = 0; i < M; i += k) { /* C in the middle between where points are expected and seen */
+            double middle[3];
+            for (int b = 0; b < 3; b++)
+                middle[b] = res->points[3 * (at[i] / k) + b] + 0.5 * out->r[3 * (at[i] / k) + b];
+            output_matrix(x, middle, Y + i * p, p);
+        }
+        for (long i = 0; i < M; i++) {
+            double half[6] = {0.0};
+            for (int s = 0; s < p; s++)
+                for (int t = 0; t < p; t++)
+                    half[t] += Y[i * p + s] * change[p * s + t];
+            for (long j = 0; j < M; j++) {
+                L[i * M + j] = res->S[at[i] * res->M + at[j]];
+                for (int t = 0; t < p; t++)
+                    L[i * M + j] += half[t] * Y[j * p + t];
+            }
+            z[i] = res->r[at[i]];
+        }
+        passed = 0;
+        for (long i = 0; i < M; i += k) {
+            double block[9];
+            copy_block(L, M, i / k, k, block);
+            double square = squared_distance(z + i, block, k);
+            for (int b = 0; b < k && square >= 0.0 && sqrt(square) <= gate; b++)
+                kept[passed++] = at[i + b];
+        }
+        if (!factor(L, M))
+            return 0;
+        solve_lower(L, M, z);
+        squared = sum_of_squares(z, M);
+        if (squared <= gate * gate || 2 * passed <= M || passed == M)
+            break;
+        M = passed; /* some few are left out */
+        memcpy(at, kept, sizeof at);
     }
-    long passed = 0;
-    for (long i = 0; i < res->m; i++) {
-        copy_block(L, M, i, k, block);
-        double square = squared_distance(res->r + k * i, block, k);
-        passed += square >= 0.0 && sqrt(square) <= gate;
-    }
-    if (!factor(L, M))
-        return 0;
-    memcpy(z, res->r, (size_t)M * sizeof(double));
-    solve_lower(L, M, z);
-    double squared = sum_of_squares(z, M);
-    if (squared > gate * gate && res->m < 2 * passed && passed < res->m)
-        return 0;
     solve_lower_rows(L, M, Y, p, p);
     for (long i = 0; i < M; i++)
         for (int s = 0; s < p; s++) {
@@ -1437,20 +1444,20 @@ static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
     int status = UNUSUAL;
     if (fill_residuals(x, table, seen, figures, limits, out, &res))
         status = judge(x, limits, out, &res);
-    if (status == DONE
-        && !((!factors->are_there
-              || learn(x, factors, limits->gate, out, &res, work, logs, information))
-             && fill_weights(limits->huber, &res, work) && correct(x, &res, work)))
+    if (status != UNUSUAL && factors->are_there
+        && !learn(x, factors, limits->gate, out, &res, work, logs, information))
         status = UNUSUAL;
+    if (status == DONE && !(fill_weights(limits->huber, &res, work) && correct(x, &res, work)))
+        status = UNUSUAL;
+    for (int j = 0; j < 2 && status != UNUSUAL && factors->are_there; j++) {
+        factors->logs[j] = logs[j];
+        memcpy(factors->information + 2 * j, information + 2 * j, 2 * sizeof(double));
+        if (factors->least < INFINITY)
+            factors->applied[j] = exp(larger(logs[j], factors->least));
+    }
     if (status == DONE) {
         move(x, res.dx, out);
         memcpy(out->weights, res.weights, (size_t)res.m * sizeof(double));
-        for (int j = 0; j < 2 && factors->are_there; j++) {
-            factors->logs[j] = logs[j];
-            memcpy(factors->information + 2 * j, information + 2 * j, 2 * sizeof(double));
-            if (factors->least < INFINITY)
-                factors->applied[j] = exp(larger(logs[j], factors->least));
-        }
         if (out->says_expected) {
             memcpy(out->expected, res.S, M * M * sizeof(double));
             memcpy(out->expected + M * M, res.R, M * (size_t)res.k * sizeof(double));

@@ -61,8 +61,8 @@ from slam_observer_ros.sensor_models.velocity_history import Velocities
 UNUSUAL, AT_REST, DONE, REJECTS = -1, 0, 1, 2
 """What a step returns; AT_REST where the motion says nothing of the noise of velocities.
 
-REJECTS where the gate does not let all points pass. Nothing is changed then, either, but weights
-say which ones it rejects, and what they were expected to be is written.
+REJECTS where the gate does not let all points pass: nothing is changed then, but weights say which
+ones it rejects, and what all of them show of the noise is learnt.
 """
 
 _PLANAR = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
@@ -252,13 +252,14 @@ def observe(
         return UNUSUAL
     if len(out.judged):
         _write_judged(residuals, judged, out.judged)
-    if judged.distances is not None and np.count_nonzero(judged.distances > limits.gate):
-        out.weights[:] = judged.distances <= limits.gate
-        return REJECTS
-    if limits.weighs_meanings and _may_be_something_else(residuals, judged, limits.gate):
-        return UNUSUAL
     learnt = None if factors is None else _learnt(factors, residuals, judged.S, limits.gate)
     if factors is not None and learnt is None:
+        return UNUSUAL
+    if judged.distances is not None and np.count_nonzero(judged.distances > limits.gate):
+        out.weights[:] = judged.distances <= limits.gate
+        _take_over(factors, learnt)
+        return REJECTS
+    if limits.weighs_meanings and _may_be_something_else(residuals, judged, limits.gate):
         return UNUSUAL
     weights = _weights(residuals, judged, limits)
     dx = None if weights is None else _correct(x, residuals, weights)
@@ -272,10 +273,7 @@ def observe(
     x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))
     out.shift[:] = dx[axes.p : x.first]
     out.weights[:] = weights
-    if factors is not None and learnt is not None:
-        factors.information[:], factors.logs[:] = learnt
-        if factors.least < math.inf:
-            factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
+    _take_over(factors, learnt)
     if len(out.expected):
         out.expected[:] = np.append(judged.S, residuals.R)
     _record(x, landmarks, seen, limits, out)
@@ -388,35 +386,44 @@ def _may_be_something_else(residuals: _Residuals, judged: _Judged, gate: float) 
     """Return whether some point is only so near to its landmark as the state is uncertain."""
     R, r = residuals.R, residuals.r[:, : residuals.axes.point]
     far = are_far(mahalanobis(r, R), gate)
-    return bool(
-        far.any() and (far & far_from_the_others(r, judged.predicted, R, gate)).any()
-    )
+    return bool(far.any() and (far & far_from_the_others(r, judged.predicted, R, gate)).any())
 
 
 def _learnt(
     factors: Factors, residuals: _Residuals, S: FloatArray, gate: float
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return F̄ (2, 2) and θ (2,) by these residuals, too; None if some are to be left out."""
-    axes, r = residuals.axes, residuals.r
-    C = axes.output_matrix(residuals.points + 0.5 * r).reshape(-1, axes.p)
+    """Return F̄ (2, 2) and θ (2,) by these residuals, too; None if S is indefinite."""
+    axes, k = residuals.axes, residuals.axes.point
+    C = axes.output_matrix(residuals.points + 0.5 * residuals.r).reshape(-1, axes.p)
     # As the likelihood at θ has it, which may be less than is applied.
     ratios = np.exp(factors.logs) / factors.applied
     N = ratios[:, None, None] * factors.shares
     if np.count_nonzero(ratios != 1.0):
         S = S + C.dot((N - factors.shares).sum(axis=0)).dot(C.T)
-    L, is_indefinite = dpotrf(S, lower=1)
-    if is_indefinite:
-        return None
-    solved = dpotrs(L, np.column_stack([residuals.flat, C]), lower=1)[0]
-    squared = float(residuals.flat.dot(solved[:, 0]))
-    if squared > gate**2:
-        passed = np.count_nonzero(
-            mahalanobis(r[:, : axes.point], diagonal_blocks(S, axes.point)) <= gate
-        )
-        if len(r) < 2 * passed < 2 * len(r):
+    r = residuals.flat
+    while True:
+        L, is_indefinite = dpotrf(S, lower=1)
+        if is_indefinite:
             return None
+        solved = dpotrs(L, np.column_stack([r, C]), lower=1)[0]
+        squared, m = float(r.dot(solved[:, 0])), len(r) // k
+        if squared <= gate**2:
+            break
+        passed = mahalanobis(r.reshape(m, k), diagonal_blocks(S, k)) <= gate
+        if not m < 2 * np.count_nonzero(passed) < 2 * m:
+            break
+        used = np.flatnonzero(np.repeat(passed, k))  # some few are left out
+        S, C, r = S[np.ix_(used, used)], C[used], r[used]
     u, G = C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:])
     return learnt(factors.logs, factors.information, *score(u, G, N, squared, len(solved)))
+
+
+def _take_over(factors: Factors | None, learnt: tuple[FloatArray, FloatArray] | None) -> None:
+    if factors is None or learnt is None:
+        return
+    factors.information[:], factors.logs[:] = learnt
+    if factors.least < math.inf:
+        factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
 
 
 def _weights(residuals: _Residuals, judged: _Judged, limits: Limits) -> FloatArray | None:

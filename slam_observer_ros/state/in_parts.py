@@ -14,13 +14,13 @@ from slam_observer_ros.observer.step import REJECTS
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import (
     corrected,
+    enter,
     is_contradiction,
     keyframe_of,
     point_covariances,
     positions,
 )
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import initialise
 from slam_observer_ros.state.usual import Corrected, NO_IDS, Outcome
 
 
@@ -40,7 +40,7 @@ def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> 
             used[known] = of_all.out.weights > 0.0
             if not _may_leave_out(state, rows[known], ~used[known]):
                 return None
-            of_used = usual.correct(state, event.select(used), rows[used], is_weighed)
+            of_used = usual.correct(state, event.select(used), rows[used], is_weighed, of_all)
         if of_all is None or of_used is None or of_used.status == REJECTS:
             return None
     rejected = known & ~used
@@ -48,7 +48,7 @@ def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> 
         state.landmarks.reject(rows[rejected], *positions(state, shown.select(rejected)))
         state.counts['rejected_landmark'] += int(np.count_nonzero(rejected))
     if len(new.ids):
-        initialise(state, new, noise)
+        enter(state, new, noise)
     past = state.relinearisation
     if past is not None and past.is_active:
         past.add(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)), in_doubt=False)

@@ -28,6 +28,7 @@ from slam_observer_ros.observer.flat_arrays import (
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.riccati import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
+from slam_observer_ros.sensor_models.motion_noise import Factors
 from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.covariances import of_pose
@@ -132,6 +133,7 @@ class Corrected(NamedTuple):
     status: int  # DONE, or REJECTS: then nothing has changed
     seen: Seen
     out: Observed
+    factors: Factors | None  # what was learnt of the noise of the motion
 
 
 def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
@@ -174,18 +176,22 @@ def takes(state: State, event: ObservationEvent) -> bool:
 
 
 def correct(
-    state: State, event: ObservationEvent, rows: IntArray, is_weighed: bool = False
+    state: State,
+    event: ObservationEvent,
+    rows: IntArray,
+    is_weighed: bool = False,
+    of_all: Corrected | None = None,
 ) -> Corrected | None:
     """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe of it.
 
-    Of an observation that it :func:`takes`.
+    Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
     """
     m, k, x = len(rows), state.axes.point, _estimate(state)
     if x is None or not 0 < m <= AT_ONCE:
         return None
     seen = _seen(state, event, rows)
     settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
-    factors = noise.flat()
+    factors = noise.flat() if of_all is None else None
     out = Observed(
         np.empty((4, 4)),
         np.empty((m, 3)),
@@ -207,22 +213,20 @@ def correct(
         settings.max_rejections,
         settings.max_hypotheses > 1,
     )
-    landmarks = Landmarks(
-        table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns
-    )
+    landmarks = Landmarks(table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns)
     figures = state.observation_noise.figures
     status = core.observe(x, landmarks, seen, figures, limits, factors, out)
     if status == step.UNUSUAL:
         return None
     if status == step.DONE:
-        noise.take(factors)
+        noise.take(factors if of_all is None else of_all.factors)
         if state.relinearisation is not None:
             state.relinearisation.note_correction(x.A, out.A)
         x.A[...] = out.A
         if len(out.shift):
             state.filter.calibration.shift(out.shift)
         state.rejected_in_a_row, state.was_contradicted = 0, False
-    return Corrected(status, seen, out)
+    return Corrected(status, seen, out, factors)
 
 
 def _estimate(state: State) -> Estimate | None:
