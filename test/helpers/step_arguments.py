@@ -93,6 +93,7 @@ def random_observation(rng):
     landmarks = Landmarks(counts, rejections, last_ns, before_ns)
     expected = (x.y_ref[rows] + x.a[rows] - x.A[:3, 3]) @ x.A[:3, :3]
     points = expected + 0.1 * rng.standard_normal((m, 3)) * (1.0, 1.0, 1.0 - x.is_planar)
+    points[0, :2] += 20.0 * (rng.random() < 0.15)  # one that is rejected
     origins = 0.2 * rng.standard_normal((m, 3)) if rng.integers(2) else None
     c_v = len(x.estimated)
     c_s = x.first - p - c_v
