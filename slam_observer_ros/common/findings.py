@@ -189,7 +189,7 @@ KINDS = {
     'left_out_points': Kind(
         Level.WARNING,
         'of {count} points seen {reasons}',
-        'see under Troubleshooting what these mean; ids are those that the sensor gives',
+        'see under Troubleshooting what these mean; ids are what the sensor gives',
     ),
     'point_noise': Kind(
         Level.NOTE,
@@ -304,13 +304,13 @@ KINDS = {
         Level.WARNING,
         'the map has {count} landmarks. Where they move, time and memory that riccati gains take '
         'grow with their square: 70 ms a step and 0.5 GB for 600 landmarks in space',
-        'max_landmarks limits them; landmark_velocity_stddev: 0.0 is for those at rest, of which '
-        'many cost no more than few',
+        'max_landmarks limits them; landmark_velocity_stddev: 0.0 is for landmarks at rest: many '
+        'of these cost no more than few',
     ),
     'loaded_map': Kind(
         Level.WARNING,
-        'the loaded map has {count} landmarks, and max_landmarks is {limit}: those that are not '
-        'seen make room for new ones',
+        'the loaded map has {count} landmarks, and max_landmarks is {limit}: what is not seen of '
+        'it makes room for new ones',
         'to keep them, set it higher, or localization_mode: uncertain',
     ),
     'left_out_correlations': Kind(
