@@ -27,7 +27,6 @@ from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
-from slam_observer_ros.sensor_models.motion import Motion
 
 if TYPE_CHECKING:
     from typing_extensions import Self
