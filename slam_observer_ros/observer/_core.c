@@ -130,10 +130,12 @@ static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
     x->n = (long)door->sizes['n'], x->room = (long)door->sizes['R'];
     x->c = (long)door->sizes['c'], x->c_v = (long)door->sizes['v'];
     door->sizes['p'] = x->p;
-    return (x->room <= MAX_ROOM && x->n <= MAX_ROOM && x->c <= MAX_ROOM && x->c_v <= x->c
-            && x->first == x->p + x->c && x->N == x->first + x->k * x->n && x->N <= x->room
-            && are_within(x->estimated, x->c_v, 12))
-           || refuse("Estimate");
+    if (x->room > MAX_ROOM || x->n > MAX_ROOM || x->c > MAX_ROOM || x->c_v > x->c
+        || x->first < x->p + x->c || x->first > x->room || x->N != x->first + x->k * x->n
+        || x->N > x->room || !are_within(x->estimated, x->c_v, 12))
+        return refuse("Estimate");
+    door->sizes['f'] = (Py_ssize_t)x->first - x->p;
+    return 1;
 }
 
 typedef struct {
@@ -224,7 +226,7 @@ typedef struct {
 
 static int read_observed(Door *door, PyObject *tuple, const Estimate *x, Observed *out) {
     static const char *const specs[] = {"D44", "Dm3", "Dm3", "Dm", "Dm3", "Dm3",
-                                        "Do33", "Dm", "Dc", "Dj", "De", NULL};
+                                        "Do33", "Dm", "Df", "Dj", "De", NULL};
     if (!read_fields(door, tuple, specs, out, "Observed"))
         return 0;
     Py_ssize_t judged = door->sizes['j'], expected = door->sizes['e'], m = door->sizes['m'];
@@ -613,9 +615,10 @@ typedef struct {
 
 /* Lay the arrays of residuals out in one piece of memory, or count how many numbers they take. */
 static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory) {
-    size_t k = (size_t)x->k, n = (size_t)m, M = n * k, c = (size_t)x->c, q = (size_t)x->first;
+    size_t k = (size_t)x->k, n = (size_t)m, M = n * k, c = (size_t)x->c;
+    size_t q = (size_t)x->p + c;
     size_t used = 0;
-    res->m = m, res->M = (long)M, res->q = x->first, res->k = x->k;
+    res->m = m, res->M = (long)M, res->q = (long)q, res->k = x->k;
 #define TAKE(field, count) (res->field = memory ? memory + used : NULL, used += (count))
     TAKE(points, 3 * n), TAKE(stated, 9 * n), TAKE(r, M), TAKE(R, M * k), TAKE(D, M * c);
     TAKE(repeated, n), TAKE(predicted, M * M), TAKE(S, M * M), TAKE(L, M * M), TAKE(z, M);
@@ -1131,7 +1134,7 @@ static void move(const Estimate *x, const double *dx, const Observed *out) {
         for (int b = 0; b < 3; b++)
             a[b] = turned_a[b] + (moved[b] + (turned[b] - y_ref[b]));
     }
-    memcpy(out->shift, dx + x->p, (size_t)x->c * sizeof(double));
+    memcpy(out->shift, dx + x->p, (size_t)(x->first - x->p) * sizeof(double));
 }
 
 /* Note that landmarks were seen, and where they should have been by the corrected state. */
@@ -1165,7 +1168,7 @@ static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
 static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Factors *factors,
                    const Observed *out) {
-    if (seen->m < 1 || seen->m > MAX_SEEN || x->first > 64 || !is_stamp(seen->stamp_ns))
+    if (seen->m < 1 || seen->m > MAX_SEEN || x->c > 64 || !is_stamp(seen->stamp_ns))
         return UNUSUAL;
     Residuals res;
     size_t numbers = lay_out(&res, x, seen->m, NULL), M = (size_t)res.M;

@@ -99,7 +99,7 @@ def advance(
     _summed_noise(Ad, se3.at_poses(Q), out)
     F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
     # x ← x + J (F c̃ + w), and ξ_i ← ξ_i + [ŷ_i]× ε_Ω of what is added to ε
-    P, of_c = x.P, slice(p, x.first)
+    P, of_c = x.P, slice(p, p + c)
     JT = np.zeros((p, len(P)))
     JT[:, :p] = np.eye(p)
     JT[:, x.first : x.size] = -axes.turn_matrix(x.y_ref + x.a).reshape(-1, p).T
@@ -317,7 +317,7 @@ def _residuals(
     # How r_i changes with the sensor that saw the point.
     D = None
     if seen.sensor is not None and len(seen.of_sensor):
-        D = np.zeros((len(r), k, x.first - axes.p))
+        D = np.zeros((len(r), k, len(x.drift)))
         of_sensor = sensor_sensitivity(seen.sensor, expected - origins)[:, :, seen.of_sensor]
         D[:, :, seen.column : seen.column + len(seen.of_sensor)] = (R_hat @ of_sensor)[:, :k]
     out.points[:], out.r[:], out.origins[:] = y, r, origins

@@ -112,8 +112,8 @@ def _led_to(
     if joint is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
     # Landmarks have no part in it.
-    P = joint.P[: joint.first, : joint.first].copy()
-    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, joint.first, joint.first)
+    P = joint.of_robot.copy()
+    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, len(P), len(P))
     status, out = _advanced(state, x, velocities, start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
