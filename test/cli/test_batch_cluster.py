@@ -12,8 +12,8 @@ import time
 from command_line import CommandLine
 import pytest
 
-from slam_observer_ros.cli.batch import pool
-from slam_observer_ros.cli.batch.run_log import read_logs
+from slam_observer_ros.cli import batch_pool
+from slam_observer_ros.cli.batch_jobs import read_logs
 
 pytest.importorskip('distributed', reason="no Dask is installed (pip's extra 'cluster')")
 
@@ -127,7 +127,7 @@ def test_a_scheduler_that_can_not_be_is_an_error_in_one_line(tmp_path):
 
 
 def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(pool, 'CONNECT_S', 1.0)
+    monkeypatch.setattr(batch_pool, 'CONNECT_S', 1.0)
     options = ('batch', SAMPLE, '--out', tmp_path / 'r', '--scheduler', 'tcp://127.0.0.1:9')
     assert 'no Dask scheduler answers there' in CommandLine(capsys).fail(*options)
     assert not list(tmp_path.iterdir())

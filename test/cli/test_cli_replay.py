@@ -20,7 +20,7 @@ from tum_files import read_tum
 import yaml
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.evaluation.truth import PoseTruth
+from slam_observer_ros.evaluation.run_record import PoseTruth
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.simulation import Scenario, Simulation
@@ -755,11 +755,11 @@ class TestRecordingsWithProblems:
 
     def test_truncated_recording_is_used_up_to_the_damage(self, slam_observer, tmp_path):
         path = tmp_path / 'long.mcap'
-        slam_observer.succeed('simulate', '--duration', 100, '--step', 0.1, '--output', path)
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
+        slam_observer.succeed('simulate', '--duration', 300, '--step', 0.1, '--output', path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
         ended = slam_observer('replay', path, '--json')
         assert ended.code == 0
-        assert 0 < ended.json['events'] < 2002
+        assert 0 < ended.json['events'] < 6002
         assert ended.errors.startswith('slam-observer: warning: ')
         assert ended.errors.count('\n') == 1
 
