@@ -296,7 +296,8 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
         piece->dt_s = seconds(ends_ns, begins_ns);
         piece->before_s[0] = seconds(begins_ns, since_ns[0]);
         piece->before_s[1] = seconds(begins_ns, since_ns[1]);
-        piece->is_stated[0] = v->is_stated[2 * row], piece->is_stated[1] = v->is_stated[2 * row + 1];
+        piece->is_stated[0] = v->is_stated[2 * row];
+        piece->is_stated[1] = v->is_stated[2 * row + 1];
         if (piece->is_stated[0] || piece->is_stated[1])
             memcpy(piece->stated, v->covariances + 36 * row, sizeof piece->stated);
         memcpy(piece->V, v->V + 6 * row, sizeof piece->V);
@@ -397,7 +398,8 @@ static void add_stated(int p, const double Ad[36], const double *before, const d
                        const Advanced *out) {
     for (int i = 0; i < 6; i++)
         for (int j = 0; j < 6; j++) {
-            double Q = 0.5 * ((before ? before[6 * i + j] : 0.0) + (after ? after[6 * i + j] : 0.0));
+            int e = 6 * i + j;
+            double Q = 0.5 * ((before ? before[e] : 0.0) + (after ? after[e] : 0.0));
             double turning = 0.5 * ((i < 3) + (j < 3)) * Q;
             for (int s = 0; s < p; s++)
                 for (int t = s; t < p && Q != 0.0; t++) {
@@ -621,8 +623,9 @@ static int advance(const Estimate *x, const Velocities *v, const Interval *inter
         memset(out->variances, 0, 6 * sizeof(double));
         for (long i = 0; i < k; i++) {
             status = pieces[i].moves ? DONE : status;
+            const double *stated = stated_of(&pieces[i]);
             for (int j = 0; j < 6; j++)
-                out->variances[j] += pieces[i].Q[j] + (stated_of(&pieces[i]) ? pieces[i].stated[7 * j] : 0.0);
+                out->variances[j] += pieces[i].Q[j] + (stated ? stated[7 * j] : 0.0);
         }
         for (long i = 0; i < k; i++)
             status = pieces[i].dt_s == 0.0 ? AT_REST : status;
@@ -1018,8 +1021,8 @@ static void step_factors(const Factors *factors, const double g[2], const double
     }
 }
 
-/* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms has
- * it, which may be less than is applied; 0 if that is indefinite. ``work``: M (M + p + 1). */
+/* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms
+ * has it, which may be less than is applied; 0 if it is indefinite. ``work``: M (M + p + 1). */
 static int learn(const Estimate *x, const Factors *factors, double gate, const Observed *out,
                  const Residuals *res, double *work, double logs[2], double information[4]) {
     int p = x->p, k = res->k, at[3 * MAX_SEEN], kept[3 * MAX_SEEN];
@@ -1036,7 +1039,7 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
     for (int i = 0; i < M; i++)
         at[i] = i;
     for (;;) {
-        for (long i = 0; i < M; i += k) { /* C in the middle between where points are expected and seen */
+        for (long i = 0; i < M; i += k) { /* C in the middle between expected and seen */
             double middle[3];
             for (int b = 0; b < 3; b++)
                 middle[b] = res->points[3 * (at[i] / k) + b] + 0.5 * out->r[3 * (at[i] / k) + b];

@@ -48,7 +48,7 @@ from slam_observer_ros.sensor_models.motion_noise import (
     motion_variances,
     MotionFigures,
     score,
-    stated_covariances as stated_motion,
+    stated_motion_covariances,
 )
 from slam_observer_ros.sensor_models.observation_noise import (
     point_covariances,
@@ -100,7 +100,9 @@ def advance(
     is_stated, stated = velocities.is_stated[rows], None
     if np.count_nonzero(is_stated):
         Q[np.repeat(is_stated, 3, axis=1)] = 0.0
-        stated = stated_motion(velocities.covariances[rows], dt_s, before_s, figures.factors)
+        stated = stated_motion_covariances(
+            velocities.covariances[rows], dt_s, before_s, figures.factors
+        )
     out.variances[:] = Q.sum(axis=0)
     _summed_noise(Ad, se3.at_poses(Q), out)
     if stated is not None:

@@ -127,7 +127,7 @@ class MotionNoise:
             variances += np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
         covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
         if some_are_stated:  # of angular and linear part one may have none
-            covariances += stated_covariances(
+            covariances += stated_motion_covariances(
                 held.covariances, held.dt_s, held.before_s, self.factors.applied
             )
         return covariances
@@ -182,7 +182,7 @@ def motion_variances(
     return grown
 
 
-def stated_covariances(
+def stated_motion_covariances(
     covariances: FloatArray, dt_s: FloatArray, before_s: FloatArray, factors: FloatArray
 ) -> FloatArray:
     """Return those (k, 6, 6) of what velocities with stated ones (k, 6, 6) move by.
