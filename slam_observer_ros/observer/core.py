@@ -12,17 +12,20 @@ VARIABLE = 'SLAM_OBSERVER_CORE'
 """Environment variable that chooses the reference where it is ``numpy``."""
 
 
-def _compiled() -> ModuleType | None:
-    """Return the compiled core; None where it was not built, or is not to be used."""
+def compiled(name: str) -> ModuleType | None:
+    """Return a compiled module of the package; None where it was not built, or is not to be used.
+
+    Of any two that were built together either both are there or none.
+    """
     if os.environ.get(VARIABLE) == 'numpy':
         return None
     try:
-        return import_module('slam_observer_ros.observer._core')
+        return import_module(f'slam_observer_ros.{name}')
     except ImportError:  # there was no compiler
         return None
 
 
-COMPILED = _compiled()
+COMPILED = compiled('observer._core')
 
 
 def description() -> str:
