@@ -2,28 +2,10 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 import os
-from types import ModuleType
 
+from slam_observer_ros.common.compiled import compiled, VARIABLE
 from slam_observer_ros.observer import step
-
-VARIABLE = 'SLAM_OBSERVER_CORE'
-"""Environment variable that chooses the reference where it is ``numpy``."""
-
-
-def compiled(name: str) -> ModuleType | None:
-    """Return a compiled module of the package; None where it was not built, or is not to be used.
-
-    Of any two that were built together either both are there or none.
-    """
-    if os.environ.get(VARIABLE) == 'numpy':
-        return None
-    try:
-        return import_module(f'slam_observer_ros.{name}')
-    except ImportError:  # there was no compiler
-        return None
-
 
 COMPILED = compiled('observer._core')
 

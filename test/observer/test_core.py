@@ -73,12 +73,16 @@ def test_wrong_arguments_are_refused_and_do_not_crash(compiled):
 
 
 def test_numpy_can_be_asked_for():
-    code = 'from slam_observer_ros.observer import core; print(core.COMPILED, core.description())'
+    code = (
+        'from slam_observer_ros.observer import core\n'
+        'from slam_observer_ros.smoothing import bordered_chain\n'
+        'print(core.COMPILED, bordered_chain.COMPILED, core.description())'
+    )
     environment = {**os.environ, core.VARIABLE: 'numpy'}
     run = subprocess.run(
         [sys.executable, '-c', code], env=environment, capture_output=True, text=True, check=True
     )
-    assert run.stdout == f'None numpy, as {core.VARIABLE} says\n'
+    assert run.stdout == f'None None numpy, as {core.VARIABLE} says\n'
 
 
 def test_sanitizers_find_nothing(tmp_path):
