@@ -145,6 +145,9 @@ class JointCovariance:
 
     # The step
 
+    def note_motion(self) -> None:
+        """Let it be known that the robot has moved."""
+
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
         """Let the robot move, and landmarks of velocities ``u`` (n, 3), to ``points`` (n, 3)."""
         if self.chart.velocity:
