@@ -28,7 +28,7 @@ IMPOSSIBLE_ID = -(2**31)
 """Landmark id of a point whose message has a number there that can't be one: it is not used."""
 
 MAX_ID = 2**32 - 2
-"""Largest landmark id: those that go out are uint32, whose last one says that it is unknown."""
+"""Largest landmark id: they go out as uint32, whose last one says that it is unknown."""
 
 FIRST_AUTOMATIC_ID = 10_000_000
 """Landmarks whose sensor gives no ids are numbered from here on."""
@@ -257,7 +257,7 @@ def flatten_velocities(body_velocities: FloatArray) -> FloatArray:
 
 
 def _turned(covariances: FloatArray, R: FloatArray) -> FloatArray:
-    """Return R C Rᵀ of covariances (…, d, d), none of which is larger than unknown."""
+    """Return R C Rᵀ of covariances (…, d, d), and no larger than unknown ones."""
     largest = np.full(len(R), MAX_DEVIATION)
     turned: FloatArray = R @ limited(covariances, largest) @ R.T
     return turned
