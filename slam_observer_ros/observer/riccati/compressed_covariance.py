@@ -93,8 +93,13 @@ class CompressedCovariance(JointCovariance):
             self.follow(-Kr)
         return Kr
 
+    def places(self, rows: IntArray) -> IntArray:
+        """Return which of the landmarks in P these are (m,)."""
+        places: IntArray = self._places[rows]
+        return places
+
     def follow(self, x: FloatArray) -> None:
-        """Let others follow as the state is moved by exp(x), of which the first entries count."""
+        """Let all others follow when the state is moved by exp(x), of which ``first`` count."""
         turn = self._axes.full_pose(x[: self._p])[:3]
         self._postponed.move(turn, x[self._entries])
         self._following.work()
