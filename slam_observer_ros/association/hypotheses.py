@@ -340,7 +340,7 @@ class Hypotheses:
             used = None if is_alone else _observed(state, event, is_weighed=True)
             meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
             for taken in meanings or interpretations(
-                state, index, seen, new_ids, new_cost, worst - cost, is_alone
+                state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
             ):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)

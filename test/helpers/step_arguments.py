@@ -58,9 +58,12 @@ def random_motion(rng):
     stamps_ns[0] = NEVER_NS
     since_ns = np.column_stack([stamps_ns - rng.integers(0, 10_000_000, r), stamps_ns])
     V = rng.standard_normal((r, 6)) * (rng.random((r, 1)) < 0.9)
-    is_stated = np.zeros((r, 2), dtype=np.bool_)
+    is_stated = (rng.random((r, 2)) < 0.5) & (rng.random() < 0.5)
+    stated = np.array([random_covariance(rng, 6, rng.choice([0.1, 100.0])) for _ in range(r)])
+    known = np.repeat(is_stated, 3, axis=1)
+    stated *= known[:, :, None] & known[:, None, :]
     usual_s = tuple(rng.choice([0.02, 0.1, np.inf], 2).tolist())
-    velocities = Velocities(stamps_ns, V, since_ns, is_stated, *usual_s, SECOND_NS)
+    velocities = Velocities(stamps_ns, V, since_ns, is_stated, stated, *usual_s, SECOND_NS)
     begin_ns = int(rng.integers(stamps_ns[1], stamps_ns[-1] + 1))
     end_ns = begin_ns + int(rng.integers(1, 500_000_000)) * int(rng.random() < 0.9)
     delay_ns = int(rng.integers(-50_000_000, 50_000_000))
