@@ -1,6 +1,7 @@
 """Where the usual step reads the arrays of a state, and a state takes over what that did.
 
-Both return None, with nothing changed, where anything is unusual: see :mod:`.observer.step`.
+Both return None, with no estimate changed, where anything is unusual: see :mod:`.observer.step`.
+Of large maps only those landmarks are read that are active, which those seen are by then.
 """
 
 from __future__ import annotations
@@ -355,7 +356,14 @@ def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Key
         sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
     stated = out.covariances if len(out.covariances) else None
     return Keyframe(
-        event.stamp_ns, corrected.rows, out.points, out.lines_of_sight, stated, out.dt_s, None, sensed
+        event.stamp_ns,
+        corrected.rows,
+        out.points,
+        out.lines_of_sight,
+        stated,
+        out.dt_s,
+        None,
+        sensed,
     )
 
 
