@@ -180,7 +180,7 @@ class Hypotheses:
                 variances = np.diagonal(motion.covariances.sum(axis=0))
             if state is not self.best:
                 continue
-            self._standing.moved.append((before, state.observer.A.copy()))
+            self._standing.moved.append(se3.between(before, state.observer.A))
             calibration = state.filter.calibration
             if calibration.delay_error_ns:
                 self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
