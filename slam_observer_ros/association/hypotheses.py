@@ -312,6 +312,7 @@ class Hypotheses:
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
+        hypothesis.note(taken, event)
         if (event.ids == UNKNOWN_ID).any():
             hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
@@ -333,9 +334,13 @@ class Hypotheses:
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
-            for taken in interpretations(
-                state, index, seen, matched, new_ids, new_cost, worst - cost, len(self._all) == 1
-            ):
+            is_alone = len(self._all) == 1
+            found = interpretations(
+                state, index, seen, matched, new_ids, new_cost, worst - cost, is_alone
+            )
+            if not is_alone:
+                found = hypothesis.consistent(found, event) or found * (number == 0)
+            for taken in found:
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)

@@ -49,6 +49,7 @@ class Interpretation:
     # Points that the gate lets pass and that are left out all the same. Their landmarks were seen
     # so seldom that the landmarks may be the outliers.
     disbelieved: ObservationEvent | None = None
+    suspects: IntArray = field(default_factory=_none)  # ids that may be wrong, left out or not
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
@@ -83,7 +84,7 @@ def interpretations(
     # Points that may be of several landmarks.
     if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
         found = find_assignments(state, index, event, new_cost, budget, is_alone)
-        return _by_assignments(state, event, new_ids, suspects, found)
+        return _of_suspects(_by_assignments(state, event, new_ids, suspects, found), suspects)
     # All ids are right, or those of one or all suspects are wrong, or the robot slipped.
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
@@ -91,7 +92,11 @@ def interpretations(
         trusting, slipped = Interpretation(event, pairing_cost(state, m, residuals)), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
     without = [_without(ids, state, matched, trusting) for ids in doubted]
-    return [trusting, *without, *slipped]
+    return _of_suspects([trusting, *without, *slipped], suspects)
+
+
+def _of_suspects(found: list[Interpretation], suspects: IntArray) -> list[Interpretation]:
+    return [replace(one, suspects=suspects) for one in found] if len(suspects) else found
 
 
 def _without(
