@@ -16,20 +16,22 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.association.contradictions import Contradictions
+from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
+    consistent,
     Interpretation,
     interpretations,
     is_ambiguous,
     may_relabel,
+    noted,
 )
 from slam_observer_ros.association.joint_compatibility import (
     pruning_cost,
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.new_landmarks import NewLandmarks
+from slam_observer_ros.association.slip import Contradictions
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
@@ -312,7 +314,7 @@ class Hypotheses:
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
-        hypothesis.note(taken, event)
+        hypothesis.verdicts = noted(hypothesis.verdicts, state, taken, event)
         if (event.ids == UNKNOWN_ID).any():
             hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
@@ -339,7 +341,8 @@ class Hypotheses:
                 state, index, seen, matched, new_ids, new_cost, worst - cost, is_alone
             )
             if not is_alone:
-                found = hypothesis.consistent(found, event) or found * (number == 0)
+                before = hypothesis.verdicts
+                found = consistent(before, state, found, event) or found * (number == 0)
             for taken in found:
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)

@@ -24,14 +24,14 @@ from slam_observer_ros.association.costs import (
     rejection_cost,
     SLIP_COST,
 )
-from slam_observer_ros.association.landmark_index import LandmarkIndex
+from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import are_far, far_from_the_others
-from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation
+from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
 from slam_observer_ros.state.state import State
 
 
@@ -121,6 +121,45 @@ def _without(
         cost - saved,
         disbelieved=event.select(np.isin(event.ids, unconfirmed_ids)),
     )
+
+
+Verdicts = dict[int, tuple[FloatArray, bool]]
+"""By id, where suspects were (3,) when they were seen last, and whether they were believed."""
+
+
+def noted(
+    verdicts: Verdicts, state: State, taken: Interpretation, event: ObservationEvent
+) -> Verdicts:
+    """Return the verdicts after an observation that was taken as interpreted."""
+    if not len(taken.suspects):
+        return verdicts
+    points, believed = positions(state, event)[0], np.isin(event.ids, taken.event.ids)
+    suspects = np.flatnonzero(np.isin(event.ids, taken.suspects)).tolist()
+    return verdicts | {int(event.ids[i]): (points[i], bool(believed[i])) for i in suspects}
+
+
+def consistent(
+    verdicts: Verdicts, state: State, possible: list[Interpretation], event: ObservationEvent
+) -> list[Interpretation]:
+    """Return the interpretations that judge points as before, where they were before.
+
+    A point that was left out and one at the same place that is believed are halves of two
+    stories, each of which another hypothesis has followed from the start.
+    """
+    if not verdicts:
+        return possible
+    event = event.select(np.isin(event.ids, list(verdicts)))
+    before = [verdicts[landmark_id] for landmark_id in event.ids.tolist()]
+    points, tolerances_m = positions(state, event)
+    shifts = points - np.reshape([place for place, _ in before], (-1, 3))
+    is_there = np.linalg.norm(shifts, axis=1) <= tolerances_m
+    ids = event.ids[is_there]
+    believed = np.array([was for _, was in before], dtype=np.bool_)[is_there]
+    return [
+        one
+        for one in possible
+        if one.slipped is not None or np.array_equal(np.isin(ids, one.event.ids), believed)
+    ]
 
 
 def is_ambiguous(state: State, matched: MatchedObservation) -> bool:

@@ -16,8 +16,8 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import block_diag
 
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks

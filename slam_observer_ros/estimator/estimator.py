@@ -12,8 +12,8 @@ import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
 from slam_observer_ros.estimator.checks import (
     check_event,
@@ -34,10 +34,10 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
+from slam_observer_ros.known_map.merging import map_of
 from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings

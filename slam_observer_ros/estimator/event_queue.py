@@ -10,9 +10,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import InvalidEventError
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,

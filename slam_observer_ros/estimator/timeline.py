@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Protocol, TypeAlias
 
 from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,

@@ -9,10 +9,10 @@ import logging
 from typing import TypeAlias
 
 from slam_observer_ros.common.errors import InvalidEventError, TransformError
-from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.inputs.pose_differences import PoseDifferences
+from slam_observer_ros.inputs.odometry import PoseDifferences
 from slam_observer_ros.messages.poses import PoseMessage
 
 MAX_WAITING = 1000

@@ -14,10 +14,9 @@ import logging
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.geometry import se3
 
 logger = logging.getLogger(__name__)

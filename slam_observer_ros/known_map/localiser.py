@@ -11,12 +11,11 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.known_map.finder import Finder
+from slam_observer_ros.known_map.finder import Finder, Unexplained
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_alignment import pose_by_tag, TagPose
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
 from slam_observer_ros.known_map.places import Place
-from slam_observer_ros.known_map.tag_pose import pose_by_tag, TagPose
-from slam_observer_ros.known_map.unexplained import Unexplained
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Outcome
 

@@ -16,7 +16,7 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import CdrReader
-from slam_observer_ros.messages.cloud_fields import skip_cloud
+from slam_observer_ros.messages.clouds import skip_cloud
 from slam_observer_ros.messages.fiducials import NESTED, observed_poses, orientations_of
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.messages.registry import Decoder, reads

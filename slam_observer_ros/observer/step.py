@@ -16,8 +16,8 @@ import numpy as np
 from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf, dpotrs
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, with_blocks

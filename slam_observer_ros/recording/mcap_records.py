@@ -22,8 +22,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.recording.sources import Loss, ros2_type, Topic
 
 _MAGIC: Final = b'\x89MCAP0\r\n'

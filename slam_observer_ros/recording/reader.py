@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from slam_observer_ros.common.errors import MessageError, RecordingError, TransformError
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import Event, VelocityBlock
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import (
@@ -28,8 +28,7 @@ from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock
 from slam_observer_ros.messages.registry import BlockDecoder
-from slam_observer_ros.recording.arrivals import Arrivals
-from slam_observer_ros.recording.contents import Contents
+from slam_observer_ros.recording.contents import Arrivals, Contents
 from slam_observer_ros.recording.decoding import (
     block_decoder,
     Decode,

@@ -9,8 +9,7 @@ from os.path import commonpath
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.messages.clouds import CLOUDS
-from slam_observer_ros.messages.poses import TRANSFORMS
-from slam_observer_ros.messages.velocities import ODOMETRY
+from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recording.sources import last_part, Topic
 from slam_observer_ros.settings.input_settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
 from slam_observer_ros.settings.message_types import message_types

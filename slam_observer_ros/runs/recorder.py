@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import is_due
+from slam_observer_ros.common.stamps import is_due
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.run_record import Innovations, Instant

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import due_rows
+from slam_observer_ros.common.stamps import due_rows, NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory

@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     flatten_velocities,

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.sensor_mounting import Sensed

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
+from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
+from slam_observer_ros.association.hypothesis import FieldOfView, LandmarkIndex, Visibility
 from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
@@ -25,11 +27,8 @@ from slam_observer_ros.association.joint_compatibility import (
     Pairs,
     PRUNING_COST,
 )
-from slam_observer_ros.association.landmark_index import LandmarkIndex
-from slam_observer_ros.association.new_landmarks import NewLandmarks
-from slam_observer_ros.association.visibility import FieldOfView, Visibility
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
@@ -42,7 +41,7 @@ from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.recording.mrclam import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file

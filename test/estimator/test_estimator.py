@@ -14,8 +14,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.association.hypotheses import Hypotheses
-from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.common.errors import MapError, ParameterError
+from slam_observer_ros.common.stamps import AGREEING_STAMPS
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator import event_warnings
 from slam_observer_ros.estimator.checks import MAX_MEASURED
@@ -23,7 +23,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.timeline import MAX_PENDING_VELOCITIES, Timeline
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.evaluation.truth import PoseTruth
+from slam_observer_ros.evaluation.run_record import PoseTruth
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     FIRST_AUTOMATIC_ID,

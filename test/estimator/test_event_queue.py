@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.stamps import AGREEING_STAMPS
 from slam_observer_ros.estimator.event_queue import EventQueue, MIN_KNOWN
 from slam_observer_ros.events import (
     AngularVelocityEvent,
