@@ -25,6 +25,7 @@ from slam_observer_ros.association.costs import (
     SLIP_COST,
 )
 from slam_observer_ros.association.hypothesis import LandmarkIndex
+from slam_observer_ros.association.joint_compatibility import joint_cost
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
@@ -33,6 +34,7 @@ from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import are_far, far_from_the_others
 from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
 from slam_observer_ros.state.state import State
+from slam_observer_ros.state.usual import Outcome
 
 
 def _none() -> IntArray:
@@ -53,13 +55,13 @@ class Interpretation:
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
+    outcome: Outcome | None = None  # where the state has already used it so
 
 
 def interpretations(
     state: State,
     index: LandmarkIndex,
     event: ObservationEvent,
-    matched: MatchedObservation,
     new_ids: IntArray,
     new_cost: float,
     budget: float,
@@ -67,13 +69,13 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
-    with the landmarks that its ids name. Points taken for landmarks not seen before get
-    ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
+    ``state`` is that at its instant, ``index`` that of its landmarks. Points taken for landmarks
+    not seen before get ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """
     # Which known landmarks are rejected, and which only pass as the state is uncertain.
+    matched = match(state, event)
     residuals, m = matched.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(state, residuals)
@@ -97,6 +99,15 @@ def interpretations(
 
 def _of_suspects(found: list[Interpretation], suspects: IntArray) -> list[Interpretation]:
     return [replace(one, suspects=suspects) for one in found] if len(suspects) else found
+
+
+def as_its_ids_say(state: State, event: ObservationEvent, outcome: Outcome) -> Interpretation:
+    """Return the only meaning of an observation that a state has used as usual."""
+    weighed, m = outcome.weighed, len(event.ids)
+    cost = m * outlier_cost(state)
+    if weighed is not None:
+        cost = joint_cost(*weighed) + (m - len(weighed.r)) * outlier_cost(state)
+    return Interpretation(event, cost, outcome=outcome)
 
 
 def _without(

@@ -208,7 +208,7 @@ class Standing:
     """Whether the robot stands while its wheels spin, and which landmarks it carries along."""
 
     carried: set[int] = field(default_factory=set)
-    excluded: set[int] = field(default_factory=set)  # that may be carried, and those that are
+    excluded: set[int] = field(default_factory=set)  # landmarks that are carried, or may be
     slip: int | None = None  # which of the SLIPS goes on
     moved: list[Move] = field(default_factory=list)  # by odometry, since a start …
     sensor_frame: str = ''  # an observation is due from another one, …

@@ -195,7 +195,7 @@ def _parts(
 def _hashes(
     args: argparse.Namespace, recordings: Sequence[Path], points: int
 ) -> tuple[dict[Path, str], list[Failure]]:
-    """Return the hash of each recording of this shard, and those that can't be read."""
+    """Return the hash of each recording of this shard, and which can't be read."""
     wanted = [recording for recording, _ in _parts(args, recordings, points)]
     pool = Pool(ThreadPoolExecutor, args.workers)
     if args.scheduler is not None:

@@ -38,7 +38,7 @@ class Links:
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """A cell of texts, of which their number is shown until it is clicked."""
+    """A cell of texts: how many is shown, and a click shows them."""
 
     texts: Sequence[str]
 
@@ -132,7 +132,7 @@ def _breakable(text: str) -> str:
 INDEX = 'index.html'
 
 SCORES = tuple(name for name in ACCURACY_ROWS if 'anees' not in name)
-"""Figures of which the least is the best."""
+"""Figures whose least value is the best."""
 
 CONSISTENCY = ('anees', 'configuration_anees', 'nis')
 """Figures that are 1 where all is as stated: a mean of them says less than their range."""

@@ -28,6 +28,7 @@ from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import kept_warnings
 from slam_observer_ros.cli.options import parse_value
 from slam_observer_ros.cli.replay_files import write_report_of
+from slam_observer_ros.cli.replay_outcome import with_logged
 from slam_observer_ros.cli.replay_request import Records, ReplayRequest
 from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.cli.replay_summary import as_json, identity, summary_rows
@@ -175,7 +176,7 @@ class Work:
         records = Records(poses=tum is not None, whole_run=report is not None)
         with kept_warnings() as warnings:
             outcome, _ = replayed(replace(job.request, records=records), shows_progress=False)
-        outcome = replace(outcome, warnings=warnings)
+        outcome = with_logged(outcome, warnings)
         if tum is not None:
             write_tum(outcome.trajectory, tum)
         if report is not None:

@@ -148,7 +148,7 @@ MAX_BEHIND = 0.01
 
 
 class Finder:
-    """Finds what ``material`` shows, of which settings state a part that is ``kept``.
+    """Finds what ``material`` shows; what is ``kept`` is as settings state it.
 
     ``advance`` is called at each run.
     """

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from slam_observer_ros.cli.shell import leaving_at_once
 from slam_observer_ros.common.digits import json_text
+from slam_observer_ros.common.findings import Finding
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -32,21 +33,24 @@ class MessageHandler(logging.Handler):
 
 
 class _Keeper(logging.Handler):
-    """Keeps the warnings, as text."""
+    """Keeps the warnings: findings, and others as text."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self.warnings: list[str] = []
+        self.warnings: list[Finding | str] = []
         self._thread = threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep one record, unless another thread's run gave it."""
-        if record.thread == self._thread:
-            self.warnings.append(' '.join(record.getMessage().split()))
+        if record.thread != self._thread:
+            return
+        first = record.args[0] if isinstance(record.args, tuple) and record.args else None
+        text = ' '.join(record.getMessage().split())
+        self.warnings.append(first if isinstance(first, Finding) else text)
 
 
 @contextmanager
-def kept_warnings() -> Iterator[list[str]]:
+def kept_warnings() -> Iterator[list[Finding | str]]:
     """Give a list that the package's warnings are added to, beside being shown."""
     keeper, package_logger = _Keeper(), logging.getLogger('slam_observer_ros')
     package_logger.addHandler(keeper)

@@ -1,4 +1,4 @@
-"""Recordings of which a part is held out, and whether what was found on the rest holds there."""
+"""What is held out of recordings, and whether what was found on the rest holds there."""
 
 from __future__ import annotations
 

@@ -240,6 +240,6 @@ def certainty(log_factor: float, deviation: float) -> str:
     """Return a factor and its interval of 95 % as text."""
     factor = math.exp(log_factor)
     if not math.isfinite(deviation):
-        return f'× {factor:.2g}, of which the recording says little'
+        return f'× {factor:.2g}, but the recording says little of it'
     low, high = (math.exp(log_factor + sign * 2.0 * deviation) for sign in (-1, 1))
     return f'× {factor:.2g} ({low:.2g} to {high:.2g})'

@@ -14,7 +14,7 @@ from slam_observer_ros.cli.replay_files import (
     records_of,
     write_files,
 )
-from slam_observer_ros.cli.replay_outcome import ReplayOutcome
+from slam_observer_ros.cli.replay_outcome import ReplayOutcome, with_logged
 from slam_observer_ros.cli.replay_request import add_run_options, read_request, warn_of_unused
 from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.cli.replay_summary import as_json, identity, summary_rows
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
         check_files(args, given.file)
         warn_of_unused(args, given)
         outcome, map_frame = replayed(replace(request, records=records_of(args)))
-    _write_and_print(args, replace(outcome, warnings=warnings), map_frame)
+    _write_and_print(args, with_logged(outcome, warnings), map_frame)
 
 
 def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:

@@ -197,8 +197,15 @@ def judged(
     findings.sort(key=lambda finding: -finding.level)
     for finding in findings:
         if finding.level >= Level.WARNING:
-            logger.warning('%s', finding.text())
+            logger.warning('%s', finding)
     return replace(outcome, findings=findings)
+
+
+def with_logged(outcome: ReplayOutcome, logged: Sequence[Finding | str]) -> ReplayOutcome:
+    """Add what was logged on the way: findings, and other warnings."""
+    others = [one for one in logged if isinstance(one, Finding) and one not in outcome.findings]
+    findings = sorted([*outcome.findings, *others], key=lambda finding: -finding.level)
+    return replace(outcome, findings=findings, warnings=[str(one) for one in logged])
 
 
 def _of_lost_pose(result: Replay, map_path: Path | None) -> list[Finding]:

@@ -134,8 +134,8 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         '--load-map',
         type=named_path,
         metavar='FILE',
-        help='known landmarks, as --map writes them, or a folder of such maps, in one of which '
-        'the robot is found: the estimate is then in their frame, and has no ANEES of the pose '
+        help='known landmarks, as --map writes them, or a folder of such maps, one of them that '
+        'of the place: the estimate is then in their frame, and has no ANEES of the pose '
         '(nor of the configuration, if they are fixed)',
     )
     parser.add_argument(

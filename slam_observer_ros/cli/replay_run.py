@@ -14,7 +14,7 @@ from slam_observer_ros.cli.console import show_progress
 from slam_observer_ros.cli.replay_outcome import judged, outcome_of, ReplayOutcome, with_smoothed
 from slam_observer_ros.cli.replay_request import Records, ReplayRequest
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.common.findings import Finding
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -56,7 +56,7 @@ def select_inputs(
 ) -> tuple[SelectedTopics, InputSettings, Truth]:
     """Return the topics to be read, the settings with the frames of these, and the truth."""
     if recording.warning:
-        logger.warning('%s', recording.warning)
+        logger.warning('%s', found('incomplete_recording', problem=recording.warning))
     selected = recording.find_topics(request.topics, request.inputs)
     inputs = _with_base_frame(request.inputs, recording, selected)
     _check_frames(inputs)
@@ -128,11 +128,7 @@ def _with_base_frame(
         if recording.contents.has_transform_of(default, selected):
             base_frame = default
         else:
-            logger.warning(
-                "The velocities don't say whose they are: '%s', the landmarks' frame, is taken "
-                'for the robot; --base-frame names another.',
-                base_frame,
-            )
+            logger.warning('%s', found('guessed_base', frame=base_frame))
     return replace(inputs, base_frame='' if base_frame in world else base_frame)
 
 

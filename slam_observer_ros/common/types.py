@@ -1,4 +1,4 @@
-"""Arrays: their types, and those that have a row for each landmark."""
+"""Arrays: their types, and columns with a row for each landmark."""
 
 from __future__ import annotations
 

@@ -236,9 +236,10 @@ class ConfigurationError:
         true_seen = se3.transform(se3.inverse(true_pose), truth.world_points)
 
         # Which true landmark each is
-        new_ids = ids if seen_ids is None else seen_ids
-        without_id = is_automatic(ids) & np.isin(ids, new_ids)
-        self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
+        without_id = is_automatic(ids)
+        if np.count_nonzero(without_id):
+            without_id &= np.isin(ids, ids if seen_ids is None else seen_ids)
+            self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
         true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
         rows, true_rows = np.nonzero(true_ids[:, None] == truth.ids)
         if not len(rows):

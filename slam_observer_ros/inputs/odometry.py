@@ -160,7 +160,7 @@ class OdometryCheck:
         self.problem = ''
         self.is_decided = False
         self._last: tuple[int, FloatArray] | None = None  # stamp, twist
-        # Sums of squares over stretches, and their number: of all, and of those that are turned.
+        # Sums of squares over stretches, and their number: of all, and of turned ones.
         self._all, self._turned = _Sums(), _Sums()
         self._start = self._by_twist = np.eye(4)
         self._along_frame = np.zeros(3)
@@ -193,7 +193,7 @@ class OdometryCheck:
         motions = by_poses, self._by_twist
         if not any(_is_long(motion) for motion in motions):
             return
-        # Poses that are not filled in say nothing, and nor do those that were reset.
+        # Poses that are not filled in, or were reset, say nothing.
         has_moved = bool((pose != self._start).any())
         if has_moved and np.linalg.norm(by_poses[:3, 3]) < MAX_SPEED * self._duration_s:
             R = self._start[:3, :3]

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.known_map.constellation import find_places, MAX_LOOKS
@@ -55,16 +56,16 @@ def warn_of_symmetry(loaded: LandmarkMap, name: str) -> None:
         return
     differ = int(np.count_nonzero(~same[0].is_same))
     x, y, _ = place_for_another(loaded, same[0]).tolist()
-    logger.warning(
-        '%s is the same turned by %.0f°%s: without ids or a start pose the robot %s; one '
-        'more landmark, at (%.1f m, %.1f m), would do.',
-        f'Map {name}' if name else 'This map',
-        same[0].turn_deg,
-        f' but for {differ} landmarks' if differ else '',
-        'is found only near these' if differ else "can't be found",
-        x,
-        y,
+    finding = found(
+        'symmetric_map',
+        name=f' {name}' if name else '',
+        turn_deg=same[0].turn_deg,
+        but=f' but for {differ} landmarks' if differ else '',
+        consequence='is found only near these' if differ else "can't be found",
+        x=x,
+        y=y,
     )
+    logger.warning('%s', finding)
 
 
 class Finder:

@@ -125,7 +125,7 @@ class Contents:
         return check.problem
 
     def begins_at_zero(self, topic: Topic, decode: Decode) -> bool:
-        """Return whether the stamps are of a simulated clock, of which zero is the first."""
+        """Return whether the stamps are of a simulated clock, which begins at zero."""
         has_begun = False
         for raw in self._source.messages((topic,)):
             with suppress(MessageError):

@@ -252,7 +252,7 @@ def _indexed(data: mmap.mmap, place: int) -> IntArray:
 
 
 def _begins(content: bytes, indexed: IntArray, take: _Take) -> IntArray:
-    """Return where messages begin in records: those that are indexed, and all in between."""
+    """Return where messages begin in records: indexed ones, and all in between."""
     heads = _heads(content, indexed)
     if (heads['opcode'] != Opcode.MESSAGE).any():
         raise ValueError('the index is wrong')

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from slam_observer_ros.common.errors import MessageError, RecordingError, TransformError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import Event, VelocityBlock
@@ -293,7 +294,8 @@ class Recording:
             return decode(raw)
         except MessageError as error:
             if raw.topic.name not in self.malformed:
-                logger.warning('%s: malformed message on %s: %s', self.path, raw.topic, error)
+                finding = found('malformed_message', path=self.path, topic=raw.topic, error=error)
+                logger.warning('%s', finding)
             self.malformed[raw.topic.name] += 1
             return None
 
@@ -320,7 +322,7 @@ class Recording:
     def _drop(self, error: DropError) -> None:
         reason = drop_reason(error)
         if not self.dropped[reason]:
-            logger.warning('Dropped a message (%s): %s', reason, error)
+            logger.warning('%s', found('dropped_message', reason=reason, error=error))
         self.dropped[reason] += 1
 
 

@@ -38,7 +38,7 @@ def write_report(
 ) -> None:
     """Write the report of a run; it is whole or not there. Raises an OutputError if it can't.
 
-    ``figures`` are shown as a table; ``warnings`` are those that no finding says.
+    ``figures`` are shown as a table; ``warnings`` are what no finding says.
     """
     text = {
         'title': title,

@@ -10,6 +10,7 @@ import numpy as np
 
 from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
@@ -136,7 +137,7 @@ def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> Trajecto
     try:
         return trajectory_errors(estimate, truth)
     except EvaluationError as error:
-        logger.warning('The %s is not compared with the truth: %s', name, error)
+        logger.warning('%s', found('uncompared', figure=name, error=error))
         return None
 
 
@@ -148,7 +149,7 @@ def _anees(
     try:
         return anchored_average_nees(trajectory, pose_covariances, truth)
     except EvaluationError as error:
-        logger.warning('The ANEES is not known: %s', error)
+        logger.warning('%s', found('unknown_anees', error=error))
         return None
 
 
@@ -158,7 +159,7 @@ def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> f
     try:
         errors = landmark_errors(ids, world_points, truth.landmarks)
     except EvaluationError as error:
-        logger.warning('The map is not compared with the truth: %s', error)
+        logger.warning('%s', found('uncompared', figure='map', error=error))
         return None
     return errors.rmse_m
 

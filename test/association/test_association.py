@@ -34,6 +34,7 @@ from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
     ObservationEvent,
+    queued,
     UNKNOWN_ID,
     VelocityEvent,
 )
@@ -352,9 +353,20 @@ def test_without_ids_real_robots_are_hardly_worse_off(data_dir):
     """Commands as odometry, blind for a minute at a time, posts of two or three barcodes."""
     ratios = []
     for robot in (2, 3):
-        run = load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot)
+        run = first_half(load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot))
         ratios.append(_configuration_rmse_m(run, nameless) / _configuration_rmse_m(run))
     assert np.mean(ratios) < 1.3
+
+
+def first_half(run):
+    velocities = len(run.velocity_stamps_ns) // 2
+    end_ns = run.velocity_stamps_ns[velocities]
+    return replace(
+        run,
+        velocity_stamps_ns=run.velocity_stamps_ns[:velocities],
+        body_velocities=run.body_velocities[:velocities],
+        observations=[event for event in run.observations if event.stamp_ns < end_ns],
+    )
 
 
 def _configuration_rmse_m(run, change=None):
@@ -765,7 +777,7 @@ def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved
     for hypothesis, yaw_rad in zip(hypotheses._all, [0.0, 0.4], strict=True):
         hypothesis.state.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
     velocities, end_ns = VelocityHistory(10**10), 6 * 10**9
-    velocities.append(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
+    velocities.append(queued(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))))
     _, before = hypotheses.pose_after(velocities, 0, end_ns)
     hypotheses.propagate(velocities, 0, end_ns)
     assert_allclose(before, hypotheses.pose_after(velocities, end_ns, end_ns)[1], atol=1e-9)

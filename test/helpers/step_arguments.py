@@ -34,7 +34,8 @@ def random_estimate(rng, n=None):
     estimated = np.sort(np.append(velocity_entries, 12)).astype(np.int64)
     c = len(estimated) + int(rng.integers(0, 4))
     n = int(rng.integers(1, 40)) if n is None else n
-    size = p + c + k * n
+    first = p + c + int(rng.integers(0, 9)) * int(rng.integers(2))  # with what is postponed
+    size = first + k * n
     room = size + int(rng.integers(0, 9))
     P = np.zeros((room, room))
     P[:size, :size] = random_covariance(rng, size)
@@ -45,7 +46,7 @@ def random_estimate(rng, n=None):
         A = se3.flatten(A)
         y_ref[:, 2] = a[:, 2] = 0.0
     drift = np.diag(rng.uniform(0.0, 1e-6, c)) * rng.integers(2)
-    return Estimate(A, y_ref, a, P, size, p + c, is_planar, calibration, estimated, drift)
+    return Estimate(A, y_ref, a, P, size, first, is_planar, calibration, estimated, drift)
 
 
 def random_motion(rng):
@@ -73,7 +74,7 @@ def random_motion(rng):
         np.zeros((4, 4)),
         np.zeros((p, p)),
         np.zeros((p, p)),
-        np.zeros((p, x.first - p)),
+        np.zeros((p, len(x.drift))),
         np.zeros(6),
         np.zeros(6),
     )
@@ -85,22 +86,22 @@ def random_observation(rng):
     x = random_estimate(rng)
     n, p, k = len(x.a), 3 if x.is_planar else 6, 2 if x.is_planar else 3
     m = int(rng.integers(1, min(n, 8) + 1))
-    rows, ids = rng.permutation(n)[:m], rng.permutation(10 * n)[:n].astype(np.int64)
-    order = np.argsort(ids)
+    rows = rng.permutation(n)[:m]
     now_ns = START_NS
     last_ns = now_ns - rng.integers(0, 3, n) * SECOND_NS
     before_ns = np.where(rng.random(n) < 0.3, -1, last_ns - SECOND_NS)
     counts, rejections = rng.integers(1, 9, n), rng.integers(0, 2, n) * rng.integers(0, 2)
-    landmarks = Landmarks(ids[order], order, counts, rejections, last_ns, before_ns)
+    landmarks = Landmarks(counts, rejections, last_ns, before_ns)
     expected = (x.y_ref[rows] + x.a[rows] - x.A[:3, 3]) @ x.A[:3, :3]
     points = expected + 0.1 * rng.standard_normal((m, 3)) * (1.0, 1.0, 1.0 - x.is_planar)
+    points[0, :2] += 20.0 * (rng.random() < 0.15)  # one that is rejected
     origins = 0.2 * rng.standard_normal((m, 3)) if rng.integers(2) else None
     c_v = len(x.estimated)
-    c_s = x.first - p - c_v
+    c_s = len(x.drift) - c_v
     is_calibrated = bool(rng.integers(2))
     seen = Seen(
         now_ns,
-        ids[rows] if rng.random() < 0.95 else ids[rows] + 1,
+        rows,
         points if origins is None else points - origins,
         origins,
         np.array([random_covariance(rng, 3, rng.choice([0.0, 0.1])) for _ in rows])
@@ -119,12 +120,12 @@ def random_observation(rng):
         factors = Factors(shares, logs, information, np.exp(np.maximum(logs, 0.0)), 0.0)
     out = Observed(
         np.zeros((4, 4)),
-        np.zeros(m, dtype=np.int64),
         *(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3))),
         np.zeros((0 if seen.covariances is None else m, 3, 3)),
         np.zeros(m),
         np.zeros(x.first - p),
         np.zeros(int(rng.choice([0, 3 * m + 1]))),
+        np.zeros(int(rng.choice([0, m * (m + 1) * k * k]))),
     )
     figures = PointFigures(*rng.uniform(1e-4, 1e-2, 5).tolist())
     assert x.size == x.first + k * n
