@@ -343,7 +343,7 @@ class Hypotheses:
             used = None if is_alone else _observed(state, event, is_weighed=True)
             meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
             found = meanings or interpretations(
-                state, index, seen, new_ids, new_cost, worst - cost, is_alone
+                state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
             )
             if not is_alone:
                 before = hypothesis.verdicts

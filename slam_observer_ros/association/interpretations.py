@@ -62,6 +62,7 @@ def interpretations(
     state: State,
     index: LandmarkIndex,
     event: ObservationEvent,
+    matched: MatchedObservation,
     new_ids: IntArray,
     new_cost: float,
     budget: float,
@@ -69,13 +70,13 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    ``state`` is that at its instant, ``index`` that of its landmarks. Points taken for landmarks
-    not seen before get ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
+    ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
+    with the landmarks that its ids name. Points taken for landmarks not seen before get
+    ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """
     # Which known landmarks are rejected, and which only pass as the state is uncertain.
-    matched = match(state, event)
     residuals, m = matched.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(state, residuals)

@@ -19,6 +19,7 @@ static const double MEMORY = 300.0;
 static const double MAX_STEP = 0.5;
 static const double LEAST_LOGARITHM = -4.605170185988091, LARGEST_LOGARITHM = 6.907755278982137;
 static const double RARE = 2.33;
+static const double MAX_SPEED_ERRORS[2] = {50.0, 1000.0};
 static const double RESOLUTION_M = 1e-4;     /* observation_noise.py */
 static const double RELATIVE_RESOLUTION = 1e-6;
 static const double MAX_ERROR_M = 1e3;
@@ -143,12 +144,14 @@ typedef struct {
     const double *V;
     const i64 *since_ns;
     const char *is_stated;
+    const double *covariances;
     double usual_s[2];
     i64 timeout_ns;
     long count;
 } Velocities;
 
-static const char *const VELOCITIES[] = {"lr", "dr6", "lr2", "?r2", "f", "f", "i", NULL};
+static const char *const VELOCITIES[] = {"lr",   "dr6", "lr2", "?r2",
+                                          "dr66", "f",   "f",   "i",   NULL};
 
 typedef struct {
     i64 start_ns, end_ns, delay_ns, reach_ns;
@@ -241,7 +244,9 @@ static int read_observed(Door *door, PyObject *tuple, const Estimate *x, Observe
 enum { MAX_PIECES = 4096 };
 
 typedef struct {
-    double dt_s, before_s[2], V[6], Q[6]; /* Q: variances of what it moves the robot by */
+    double dt_s, before_s[2], V[6], Q[6]; /* Q: variances of what it moves the robot by, … */
+    double stated[36];                    /* … and covariances, where they were stated */
+    int is_stated[2];
     double until_s, moved[6];             /* sums up to its end */
     int moves;
 } Piece;
@@ -277,7 +282,7 @@ static void calibrated(const Estimate *x, const double V[6], double out[6]) { /*
         out[j] = V[j] * x->calibration[j] + (is_moving ? x->calibration[6 + j] : 0.0);
 }
 
-/* Fill in pieces [first, last); 0 for gaps, and where velocities have covariances of their own. */
+/* Fill in pieces [first, last); 0 for gaps. */
 static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns, i64 end_ns,
                        int is_planar, Piece *pieces) {
     for (long row = first; row < last; row++) {
@@ -286,12 +291,15 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
         i64 begins_ns = row == first ? start_ns : v->stamps_ns[row];
         i64 ends_ns = row + 1 < last ? v->stamps_ns[row + 1] : end_ns;
         if (!is_stamp(begins_ns) || !is_stamp(ends_ns) || !is_stamp(since_ns[0])
-            || !is_stamp(since_ns[1]) || v->is_stated[2 * row] || v->is_stated[2 * row + 1]
-            || since_ns[1] + v->timeout_ns < ends_ns)
+            || !is_stamp(since_ns[1]) || since_ns[1] + v->timeout_ns < ends_ns)
             return 0;
         piece->dt_s = seconds(ends_ns, begins_ns);
         piece->before_s[0] = seconds(begins_ns, since_ns[0]);
         piece->before_s[1] = seconds(begins_ns, since_ns[1]);
+        piece->is_stated[0] = v->is_stated[2 * row];
+        piece->is_stated[1] = v->is_stated[2 * row + 1];
+        if (piece->is_stated[0] || piece->is_stated[1])
+            memcpy(piece->stated, v->covariances + 36 * row, sizeof piece->stated);
         memcpy(piece->V, v->V + 6 * row, sizeof piece->V);
         only_counting(piece->V, is_planar);
         piece->moves = moves(piece->V);
@@ -335,6 +343,21 @@ static void add_scale_noise(Piece *pieces, long k, const double scales[6]) {
     }
 }
 
+/* What is stated is of one error for as long as a velocity is held, which moves the robot by so
+ * much more; errors beyond the largest that there are say no more than these. */
+static void fill_stated(Piece *piece, const double factors[2]) {
+    double grown_s[6], *C = piece->stated;
+    for (int j = 0; j < 6; j++) {
+        double squared = piece->dt_s * (2.0 * piece->before_s[j / 3] + piece->dt_s);
+        double deviation = sqrt(larger(C[7 * j], 0.0)), largest = MAX_SPEED_ERRORS[j / 3];
+        grown_s[j] = sqrt(squared * factors[j / 3]) * largest / larger(deviation, largest);
+        piece->Q[j] *= !piece->is_stated[j / 3];
+    }
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++)
+            C[6 * i + j] *= grown_s[i] * grown_s[j];
+}
+
 /* White noise: held longer than usual, one error has moved the robot by so much more. */
 static void fill_variances(Piece *pieces, long k, const Velocities *v, const Interval *interval,
                            const MotionFigures *figures) {
@@ -360,6 +383,30 @@ static void fill_variances(Piece *pieces, long k, const Velocities *v, const Int
     for (long i = 0; i < k; i++)
         for (int j = 0; j < 6; j++)
             pieces[i].Q[j] *= figures->factors[j / 3];
+    for (long i = 0; i < k; i++)
+        if (pieces[i].is_stated[0] || pieces[i].is_stated[1])
+            fill_stated(&pieces[i], figures->factors);
+}
+
+static const double *stated_of(const Piece *piece) { /* NULL where nothing is stated */
+    return piece && (piece->is_stated[0] || piece->is_stated[1]) ? piece->stated : NULL;
+}
+
+/* Add Ad Q Ad' of what is stated: half of the pieces before and after a pose, either of which may
+ * be NULL. What turning and driving share is half theirs. */
+static void add_stated(int p, const double Ad[36], const double *before, const double *after,
+                       const Advanced *out) {
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++) {
+            int e = 6 * i + j;
+            double Q = 0.5 * ((before ? before[e] : 0.0) + (after ? after[e] : 0.0));
+            double turning = 0.5 * ((i < 3) + (j < 3)) * Q;
+            for (int s = 0; s < p; s++)
+                for (int t = s; t < p && Q != 0.0; t++) {
+                    out->noise[s * p + t] += Ad[6 * s + i] * Q * Ad[6 * t + j];
+                    out->of_turning[s * p + t] += Ad[6 * s + i] * turning * Ad[6 * t + j];
+                }
+        }
 }
 
 /* The estimated rows of Ad = [[R, 0], [hat(x) R, R]], (p, 6). */
@@ -393,6 +440,8 @@ static void add_at_pose(const Estimate *x, const double Ad[36], const Piece *bef
             out->of_turning[s * p + t] += turning;
             out->noise[s * p + t] += turning + driving;
         }
+    if (stated_of(before) || stated_of(after))
+        add_stated(p, Ad, stated_of(before), stated_of(after), out);
     for (long j = 0; j < x->c_v; j++) {
         int column = (int)x->estimated[j] % 6, is_bias = x->estimated[j] >= 6;
         double share = 0.0;
@@ -574,8 +623,9 @@ static int advance(const Estimate *x, const Velocities *v, const Interval *inter
         memset(out->variances, 0, 6 * sizeof(double));
         for (long i = 0; i < k; i++) {
             status = pieces[i].moves ? DONE : status;
+            const double *stated = stated_of(&pieces[i]);
             for (int j = 0; j < 6; j++)
-                out->variances[j] += pieces[i].Q[j];
+                out->variances[j] += pieces[i].Q[j] + (stated ? stated[7 * j] : 0.0);
         }
         for (long i = 0; i < k; i++)
             status = pieces[i].dt_s == 0.0 ? AT_REST : status;
@@ -971,8 +1021,8 @@ static void step_factors(const Factors *factors, const double g[2], const double
     }
 }
 
-/* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms has
- * it, which may be less than is applied; 0 if that is indefinite. ``work``: M (M + p + 1). */
+/* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms
+ * has it, which may be less than is applied; 0 if it is indefinite. ``work``: M (M + p + 1). */
 static int learn(const Estimate *x, const Factors *factors, double gate, const Observed *out,
                  const Residuals *res, double *work, double logs[2], double information[4]) {
     int p = x->p, k = res->k, at[3 * MAX_SEEN], kept[3 * MAX_SEEN];
@@ -989,7 +1039,7 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
     for (int i = 0; i < M; i++)
         at[i] = i;
     for (;;) {
-        for (long i = 0; i < M; i += k) { /* C in the middle between where points are expected and seen */
+        for (long i = 0; i < M; i += k) { /* C in the middle between expected and seen */
             double middle[3];
             for (int b = 0; b < 3; b++)
                 middle[b] = res->points[3 * (at[i] / k) + b] + 0.5 * out->r[3 * (at[i] / k) + b];

@@ -48,6 +48,7 @@ from slam_observer_ros.sensor_models.motion_noise import (
     motion_variances,
     MotionFigures,
     score,
+    stated_motion_covariances,
 )
 from slam_observer_ros.sensor_models.observation_noise import (
     point_covariances,
@@ -80,10 +81,11 @@ def advance(
     out: Advanced,
 ) -> int:
     """Move X̂ along velocities (27), with what that does to P."""
-    pieces = _pieces(velocities, interval, x.is_planar)
+    pieces = _pieces(velocities, interval)
     if pieces is None:
         return UNUSUAL
-    V, dt_s, before_s = pieces
+    rows, dt_s, before_s = pieces
+    V = _counting(velocities.body_velocities[rows], x.is_planar)
     axes, (p, c) = axes_of(x.is_planar), out.sensitivity.shape
     # (27)  Â ← Â exp(V dt), V = (1 + s) ∘ V_measured + b
     path = se3.path(x.A, _calibrated(x, V) * dt_s[:, None])
@@ -95,8 +97,17 @@ def advance(
     usual_s = np.array([velocities.usual_angular_s, velocities.usual_linear_s])
     usual_s += max(to_s(-interval.delay_ns), 0.0)
     Q = motion_variances(V, dt_s, before_s, usual_s, figures)
+    is_stated, stated = velocities.is_stated[rows], None
+    if np.count_nonzero(is_stated):
+        Q[np.repeat(is_stated, 3, axis=1)] = 0.0
+        stated = stated_motion_covariances(
+            velocities.covariances[rows], dt_s, before_s, figures.factors
+        )
     out.variances[:] = Q.sum(axis=0)
     _summed_noise(Ad, se3.at_poses(Q), out)
+    if stated is not None:
+        out.variances[:] += np.diagonal(stated.sum(axis=0))
+        _add_summed(Ad, se3.at_poses(stated), out)
     F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
     # x ← x + J (F c̃ + w), and ξ_i ← ξ_i + [ŷ_i]× ε_Ω of what is added to ε
     P, of_c = x.P, slice(p, p + c)
@@ -112,23 +123,19 @@ def advance(
 
 
 def _pieces(
-    velocities: Velocities, interval: Interval, is_planar: bool
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return velocities (k, 6), for how long each is held, and (k, 2) was before; None for gaps.
-
-    None, too, where some of them come with covariances of their own.
-    """
+    velocities: Velocities, interval: Interval
+) -> tuple[slice, FloatArray, FloatArray] | None:
+    """Return k velocities, for how long each is held, and (k, 2) was before; None for gaps."""
     start_ns, end_ns = interval.start_ns - interval.delay_ns, interval.end_ns - interval.delay_ns
     first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
     last = max(int(velocities.stamps_ns.searchsorted(end_ns, 'left')), first + 1)
     bounds_ns = np.append(velocities.stamps_ns[first:last], end_ns)
-    if end_ns < start_ns or first < 0 or velocities.is_stated[first:last].any():
+    if end_ns < start_ns or first < 0:
         return None
     bounds_ns[0], since_ns = start_ns, velocities.since_ns[first:last]
     if (since_ns[:, 1] + velocities.timeout_ns < bounds_ns[1:]).any():
         return None
-    V = _counting(velocities.body_velocities[first:last], is_planar)
-    return V, to_s(np.diff(bounds_ns)), to_s(bounds_ns[:-1, None] - since_ns)
+    return slice(first, last), to_s(np.diff(bounds_ns)), to_s(bounds_ns[:-1, None] - since_ns)
 
 
 def _counting(V: FloatArray, is_planar: bool) -> FloatArray:
@@ -148,6 +155,16 @@ def _summed_noise(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
     out.noise[:] = (flat * shares.ravel()).dot(flat.T)
     shares[:, 3:] = 0.0
     out.of_turning[:] = (flat * shares.ravel()).dot(flat.T)
+
+
+def _add_summed(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
+    """Add Σ Ad_Â Q Ad_Âᵀ, ``shares`` (k + 1, 6, 6) of Q; what both kinds share is half theirs."""
+    p = len(out.noise)
+    flat = Ad.swapaxes(0, 1).reshape(p, -1)
+    out.noise[:] += (Ad @ shares).swapaxes(0, 1).reshape(p, -1).dot(flat.T)
+    shares[:, :, 3:] = 0.0
+    half = 0.5 * (Ad @ shares).swapaxes(0, 1).reshape(p, -1).dot(flat.T)
+    out.of_turning[:] += half + half.T
 
 
 def _sensitivity(

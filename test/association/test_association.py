@@ -48,6 +48,7 @@ from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 from slam_observer_ros.state.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM
+from slam_observer_ros.state.matching import match
 from slam_observer_ros.state.state import State
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'wheeled_bearing_range.yaml'
@@ -516,7 +517,8 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         state, index = estimator._hypotheses.best, LandmarkIndex()
-        (only,) = interpretations(state, index, event, np.arange(3), 20.0, np.inf)
+        matched = match(state, event)
+        (only,) = interpretations(state, index, event, matched, np.arange(3), 20.0, np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 

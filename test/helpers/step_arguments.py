@@ -58,9 +58,12 @@ def random_motion(rng):
     stamps_ns[0] = NEVER_NS
     since_ns = np.column_stack([stamps_ns - rng.integers(0, 10_000_000, r), stamps_ns])
     V = rng.standard_normal((r, 6)) * (rng.random((r, 1)) < 0.9)
-    is_stated = np.zeros((r, 2), dtype=np.bool_)
+    is_stated = (rng.random((r, 2)) < 0.5) & (rng.random() < 0.5)
+    stated = np.array([random_covariance(rng, 6, rng.choice([0.1, 100.0])) for _ in range(r)])
+    known = np.repeat(is_stated, 3, axis=1)
+    stated *= known[:, :, None] & known[:, None, :]
     usual_s = tuple(rng.choice([0.02, 0.1, np.inf], 2).tolist())
-    velocities = Velocities(stamps_ns, V, since_ns, is_stated, *usual_s, SECOND_NS)
+    velocities = Velocities(stamps_ns, V, since_ns, is_stated, stated, *usual_s, SECOND_NS)
     begin_ns = int(rng.integers(stamps_ns[1], stamps_ns[-1] + 1))
     end_ns = begin_ns + int(rng.integers(1, 500_000_000)) * int(rng.random() < 0.9)
     delay_ns = int(rng.integers(-50_000_000, 50_000_000))
@@ -136,40 +139,51 @@ def wrong(rng, arguments):
     """Return the arguments with one of them, or a part of one, exchanged for something else."""
     arguments = list(arguments)
     at = int(rng.integers(len(arguments)))
-    if arguments[at] is None:
-        arguments[at] = 3
+    if not isinstance(arguments[at], tuple):
+        arguments[at] = 3 if arguments[at] is None else other_than(rng, arguments[at])
         return arguments
     parts = list(arguments[at])
     part = int(rng.integers(len(parts)))
-    value = parts[part]
+    parts[part] = other_than(rng, parts[part])
+    arguments[at] = tuple(parts)
+    return arguments
+
+
+def other_than(rng, value):
+    """Return what a value is not."""
     others = [None, 'x', -1, 2**62, -(2**62), 10**30, float('nan'), np.empty(0), (), b'']
     if isinstance(value, np.ndarray):
+        with np.errstate(over='ignore'):
+            single = value.astype(np.float32)
         others += [
             value[..., None],
             value[:-1] if value.ndim else value,
-            value.astype(np.float32),
+            single,
             np.asfortranarray(np.repeat(value, 2, axis=-1))[..., ::2] if value.ndim else value,
             np.full(value.shape, 2**62, dtype=np.int64),
             np.full(value.shape, np.nan),
             np.full(value.shape, 1e300),
             np.zeros_like(value),
         ]
-    parts[part] = others[int(rng.integers(len(others)))]
-    arguments[at] = type(arguments[at])(*parts)
-    return arguments
+    return others[int(rng.integers(len(others)))]
+
+
+def refusals(rng, calls):
+    """Make calls, each with its arguments and with wrong ones; count those that are refused."""
+    refused = 0
+    for call, arguments in calls:
+        call(*arguments)
+        try:
+            call(*wrong(rng, arguments))
+        except (ValueError, TypeError, BufferError, OverflowError):
+            refused += 1
+    return refused
 
 
 def fuzz(core, seed, rounds):
     """Call both functions with arguments that are right and with wrong ones; count refusals."""
     rng, refused = np.random.default_rng(seed), 0
     for _ in range(rounds):
-        for call, arguments in (
-            (core.advance, random_motion(rng)),
-            (core.observe, random_observation(rng)),
-        ):
-            call(*arguments)
-            try:
-                call(*wrong(rng, arguments))
-            except (ValueError, TypeError, BufferError, OverflowError):
-                refused += 1
+        calls = (core.advance, random_motion(rng)), (core.observe, random_observation(rng))
+        refused += refusals(rng, calls)
     return refused

@@ -12,7 +12,7 @@ import pytest
 from slam_observer_ros.association.costs import pairing_cost
 from slam_observer_ros.association.interpretations import as_its_ids_say
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.observer import core
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import match
@@ -203,6 +203,28 @@ def test_what_is_new_or_rejected_is_left_to_python_and_the_rest_is_usual(
             break
     assert both.used[in_parts] >= 10
     assert both.entered >= 5 and both.rejected >= 3
+
+
+@pytest.mark.parametrize('parts', [6, 3])
+def test_velocities_may_state_their_covariances(worlds, monkeypatch, parts):
+    """Of both parts, or of the angular one alone: every other one does."""
+    rng = np.random.default_rng(0)
+    world = worlds.load('simulated loop, wheeled')
+    stated = np.zeros((6, 6))
+    M = 0.05 * rng.standard_normal((parts, 2 * parts))
+    stated[:parts, :parts] = M @ M.T
+    both = BothWays(monkeypatch)
+    settings = replace(world.settings, relinearization_angle=1e3)
+    estimator = Estimator(settings, judges_innovations=True)
+    for number, event in enumerate(world.events):
+        if isinstance(event, VelocityEvent) and number % 2:
+            event = replace(event, covariance=stated)
+        estimator.add(event)
+        ask_for_poses(estimator)
+        if both.observed >= OBSERVATIONS // 3:
+            break
+    assert both.moved >= 15
+    assert both.answered >= USUAL_SHARE * both.asked or core.COMPILED is None
 
 
 def test_points_of_any_precision_and_order_are_taken(worlds):
