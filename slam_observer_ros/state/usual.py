@@ -5,6 +5,7 @@ Both return None, with nothing changed, where anything is unusual: see :mod:`.ob
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -86,38 +87,45 @@ def pose_after(
     state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
 ) -> tuple[FloatArray, FloatArray | None] | None:
     """As :meth:`.State.pose_after`."""
-    found = _led_to(state, velocities.flat(), start_ns, end_ns)
-    return None if found is None else _in_world(state, *found)
+    found = _led_to(state, [velocities.flat()], start_ns, [end_ns])
+    if found is None:
+        return None
+    (A,), (covariance,) = found
+    return _in_world(state, A, covariance)
 
 
 def poses_until(
     state: State, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
 ) -> tuple[FloatArray, FloatArray | None] | None:
     """As :meth:`.State.poses_until`."""
-    poses, covariances = np.empty((len(stamps_ns), 4, 4)), np.empty((len(stamps_ns), 6, 6))
     known_then = velocities.flat_then(stamps_ns)
-    for row, (known, stamp_ns) in enumerate(zip(known_then, stamps_ns.tolist(), strict=True)):
-        found = _led_to(state, known, start_ns, stamp_ns)
-        if found is None:
-            return None
-        poses[row], covariances[row] = found
-    return _in_world(state, poses, covariances)
+    found = _led_to(state, known_then, start_ns, stamps_ns.tolist())
+    return None if found is None else _in_world(state, *found)
 
 
 def _led_to(
-    state: State, velocities: Velocities, start_ns: int, end_ns: int
+    state: State, velocities: Sequence[Velocities], start_ns: int, ends_ns: Sequence[int]
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return Â and the covariance (6, 6) of ε to which :func:`advance` would lead."""
+    """Return Â (s, 4, 4) and covariances (s, 6, 6) of ε to which :func:`advance` would lead.
+
+    Until each instant along what is known of velocities then.
+    """
     joint, axes = state.filter.joint, state.axes
     if joint is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
     # Landmarks have no part in it.
-    P = joint.of_robot.copy()
+    now = joint.of_robot
+    P, p, figures = now.copy(), axes.p, state.motion_noise.figures
     x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, len(P), len(P))
-    status, out = _advanced(state, x, velocities, start_ns, end_ns)
-    if status == step.UNUSUAL:
-        return None
-    return out.A, axes.full_pose_covariance(P[: axes.p, : axes.p])
+    A, covariances = np.empty((len(ends_ns), 4, 4)), np.zeros((len(ends_ns), 6, 6))
+    out = _room_for_motion(state)
+    for row, (known, end_ns) in enumerate(zip(velocities, ends_ns, strict=True)):
+        P[...] = now
+        interval = _interval(state, start_ns, end_ns)
+        if core.advance(x, known, interval, figures, out) == step.UNUSUAL:
+            return None
+        A[row], covariances[row, axes.pose, axes.pose] = out.A, P[:p, :p]
+    return A, covariances
 
 
 def _in_world(
@@ -264,23 +272,31 @@ def _advanced(
     state: State, x: Estimate, velocities: Velocities, start_ns: int, end_ns: int
 ) -> tuple[int, Advanced]:
     """Move ``x`` on along velocities (27); return whether that was usual, and what it did."""
-    calibration, p = state.filter.calibration, state.axes.p
-    interval = Interval(
+    interval, out = _interval(state, start_ns, end_ns), _room_for_motion(state)
+    return core.advance(x, velocities, interval, state.motion_noise.figures, out), out
+
+
+def _interval(state: State, start_ns: int, end_ns: int) -> Interval:
+    calibration = state.filter.calibration
+    return Interval(
         start_ns,
         end_ns,
         calibration.delay_ns,
         calibration.delay_error_ns,
         state._end_velocity,
     )
-    out = Advanced(
+
+
+def _room_for_motion(state: State) -> Advanced:
+    p, c = state.axes.p, state.filter.calibration.count
+    return Advanced(
         np.empty((4, 4)),
         np.empty((p, p)),
         np.empty((p, p)),
-        np.empty((p, calibration.count)),
+        np.empty((p, c)),
         np.empty(6),
         np.empty(6),
     )
-    return core.advance(x, velocities, interval, state.motion_noise.figures, out), out
 
 
 def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
