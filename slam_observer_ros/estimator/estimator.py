@@ -365,7 +365,8 @@ class Estimator:
     @property
     def pose(self) -> FloatArray:
         """(4, 4) estimated pose at ``stamp_ns``, body to world."""
-        return self.pose_at(self.stamp_ns or 0)
+        leads_on = self._timeline.lead_s > 0.0
+        return self.uncertain_pose[0] if leads_on else self._state.observer.pose
 
     def pose_at(self, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) at any time: the state, moved on by the velocities since."""
@@ -402,9 +403,15 @@ class Estimator:
         Along the world's axes; it includes that the most likely hypothesis may be wrong. None
         where the filter knows no covariance.
         """
+        return self.uncertain_pose[1]
+
+    @property
+    def uncertain_pose(self) -> tuple[FloatArray, FloatArray | None]:
+        """:attr:`pose` and :attr:`pose_covariance`, both for what one of them costs."""
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        return self._hypotheses.pose_after(timeline.velocities, start_ns, end_ns)[1]
+        pose, covariance = self._hypotheses.pose_after(timeline.velocities, start_ns, end_ns)
+        return pose if end_ns > start_ns else self._state.observer.pose, covariance
 
     @property
     def body_velocity(self) -> FloatArray:
@@ -423,10 +430,10 @@ class Estimator:
             return None
         known, axes = self._state.filter, self._state.filter.axes
         measured = self._state.motion_noise.velocity_covariance(held)
+        if axes.p < len(measured):
+            measured = axes.full_pose_covariance(measured[axes.pose, axes.pose])
         return known.calibration.apply_to_covariance(
-            axes.full_pose_covariance(measured[axes.pose, axes.pose]),
-            held.body_velocities[0],
-            known.calibration_variances,
+            measured, held.body_velocities[0], known.calibration_variances
         )
 
     @property
