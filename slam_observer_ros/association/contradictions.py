@@ -49,7 +49,7 @@ class Contradictions:
         known, settings = matched.known, state.settings
         if not len(known.ids):
             return False
-        if (state.filter.distances(matched.residuals) <= settings.rejection_threshold).any():
+        if (state.gains.distances(matched.residuals) <= settings.rejection_threshold).any():
             self.clear()
             return False
         may_stray = settings.unknown_linear_motion or settings.unknown_angular_motion
@@ -65,7 +65,7 @@ class Contradictions:
         """Return whether a pose that explains what is seen explains the ``others``, too."""
         trial = state.copy()
         slip(trial, matched)
-        trial.filter.correct(match(trial, matched.event).residuals)
+        trial.gains.observe(match(trial, matched.event).residuals)
         ids = np.array(others)
         rows = trial.landmarks.rows_of(ids)
         rejected = [self._rejected[i] for i in others]
@@ -82,9 +82,9 @@ class Contradictions:
         )
         if (rows < 0).any():  # one was forgotten meanwhile
             return False
-        trial.filter.expected_points(rows)
+        trial.gains.prepare(rows)
         residuals = residuals_of(trial, seen, rows, np.array([o.covariance for o in rejected]))
-        return bool((trial.filter.distances(residuals) <= AGREEMENT).all())
+        return bool((trial.gains.distances(residuals) <= AGREEMENT).all())
 
     def _note(self, state: State, matched: MatchedObservation) -> None:
         """Note where landmarks seem to be that are rejected."""

@@ -50,7 +50,7 @@ def slip(state: State, matched: MatchedObservation) -> float:
         covariances=noise,
         duration_s=0.0,
         at_ends=None,
-        calibration=state.filter.calibration,
+        calibration=state.calibration,
         is_slip=True,
     )
     state.propagate(motion)

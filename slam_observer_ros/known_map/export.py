@@ -25,11 +25,11 @@ def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
     """
     rows = state.confirmed
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
-    if state.is_fixed and loaded is not None:
+    if state.observer.is_exact and loaded is not None:
         return _exact_map(state, rows, loaded)
     landmark_map = LandmarkMap(
         state.landmarks.ids[rows],
-        state.filter.world_points[rows],
+        state.observer.world_points[rows],
         None,
         state.landmarks.counts[rows],
         orientations=_orientations_of(state, rows),
@@ -55,7 +55,7 @@ def _with_covariances(
         of_turns = diagonal_blocks(joint[3 * n :, 3 * n :], 3)
         sigmas[tags] = np.sqrt(np.maximum(np.linalg.eigvalsh(of_turns)[:, -1], 0.0))
     elif len(tags):
-        sigmas[tags] = state.filter.orientation_sigmas(rows[tags])
+        sigmas[tags] = state.known_errors.orientation_sigmas(rows[tags])
     return replace(
         landmark_map,
         covariances=covariances,
@@ -73,9 +73,9 @@ def _exact_map(state: State, rows: IntArray, loaded: LandmarkMap) -> LandmarkMap
 
 def _orientations_of(state: State, rows: IntArray) -> FloatArray | None:
     """Return orientations (m, 3, 3) in the world."""
-    tags = state.filter.orientations
+    tags = state.observer.orientations
     if not tags.are_known[rows].any():
         return None
-    B = state.filter.orientation_matrices(rows)
+    B = state.known_errors.orientation_matrices(rows)
     world: FloatArray = state.observer.reference_pose[:3, :3] @ B
     return world

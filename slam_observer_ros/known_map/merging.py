@@ -39,7 +39,7 @@ def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray |
     """
     state.set_pose(state.observer.pose, pose_covariance)
     if state.settings.localization_mode != 'fixed':
-        state.filter.add_known(_in_reference_frame(state, known))
+        state.gains.add_known(_in_reference_frame(state, known))
     _complete(state, known, known)
 
 
@@ -87,9 +87,9 @@ def joint_covariance(
     shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None where
     the gains know no joint covariance.
     """
-    m, axes, points = len(rows), state.axes, state.filter.points[rows]
-    joint = state.filter.joint
-    P = None if joint is None else joint.of_landmarks(rows, points, tags)
+    m, axes, points = len(rows), state.axes, state.observer.points[rows]
+    errors = state.errors
+    P = None if errors is None else errors.joint.of_landmarks(rows, points, tags)
     if P is None or m == 0:
         return P
     # As the square of a root, so that rounding makes no variance negative, however small it is.
@@ -127,11 +127,11 @@ def _find_frame(
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
     axes = state.axes
-    covariance = state.filter.joint_covariance(rows)
+    covariance = state.gains.joint_covariance(rows)
     if covariance is None:
         covariance = _of_constant_gains(state, rows)
     target = known.landmarks_in(np.eye(4), state.settings.map_noise)
-    return find_transform(state.filter.points[rows], covariance, target, axes)
+    return find_transform(state.observer.points[rows], covariance, target, axes)
 
 
 def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
@@ -150,7 +150,7 @@ def _merge(state: State, known: LandmarkMap) -> None:
     merged, others = np.flatnonzero(rows >= 0), np.flatnonzero(rows < 0)
     rows, is_exact = rows[merged], state.settings.localization_mode == 'fixed'
     taken = merged if is_exact else np.append(merged, others)
-    state.filter.enter_map(rows, _in_reference_frame(state, known.select(taken)))
+    state.gains.enter_map(rows, _in_reference_frame(state, known.select(taken)))
     state.landmarks.counts[rows] += _counts(known.select(merged), state)
     _complete(state, known, known.select(others))
 
@@ -195,8 +195,7 @@ def _fix(state: State, known: LandmarkMap) -> None:
     order = np.argsort(known.ids)
     rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
     exact = _in_reference_frame(state, known.select(rows))
-    state.fix_landmarks(exact.points, exact.covariances)
-    state.filter.take_orientations(np.arange(len(exact)), exact)
+    state.fix_landmarks(exact)
 
 
 def _in_reference_frame(state: State, known: LandmarkMap) -> KnownLandmarks:

@@ -9,7 +9,8 @@ import numpy as np
 from slam_observer_ros.common.columns import LandmarkColumns
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.observer.orientations import LandmarkOrientations
-from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.sensor_models.calibration import Calibration
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -22,7 +23,8 @@ class FilterArrays(LandmarkColumns):
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
     each (n, 3), metres and m/s, the ``orientations`` of tags, and ``covariance``, P (N, N), empty
     for gains that know none.
-    ``have_moved`` says whether any landmark has had a velocity so far.
+    ``calibration`` is that of velocities and sensors. ``have_moved`` says whether any landmark has
+    had a velocity so far, ``is_exact`` that the map is, and no landmark is moved.
     """
 
     COLUMNS: ClassVar = dict.fromkeys(('y_ref', 'a', 'u'), (np.float64, (3,)))
@@ -30,13 +32,14 @@ class FilterArrays(LandmarkColumns):
     a: FloatArray
     u: FloatArray
 
-    def __init__(self, reference_pose: FloatArray) -> None:
+    def __init__(self, reference_pose: FloatArray, calibration: Calibration) -> None:
         super().__init__()
         self.reference_pose: FloatArray = np.array(reference_pose)
         self.A: FloatArray = np.eye(4)
         self.covariance = SymmetricMatrix(np.zeros((0, 0)))
         self.orientations = LandmarkOrientations()
-        self.have_moved = False
+        self.calibration = calibration
+        self.have_moved = self.is_exact = False
 
     @property
     def P(self) -> FloatArray:  # noqa: N802 (the field's name for it)
@@ -49,4 +52,5 @@ class FilterArrays(LandmarkColumns):
         other.reference_pose, other.A = self.reference_pose.copy(), self.A.copy()
         other.covariance = self.covariance.copy()
         other.orientations = self.orientations.copy()
+        other.calibration = self.calibration.copy()
         return other

@@ -24,7 +24,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Observed,
     Seen,
 )
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.riccati import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory
@@ -56,7 +56,7 @@ def advance(
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    calibration = state.filter.calibration
+    calibration = state.calibration
     if state.relinearisation is not None and state.relinearisation.is_active:
         history = state.relinearisation.history
         history.begin(x.A)
@@ -97,10 +97,11 @@ def _led_to(
     state: State, velocities: Velocities, start_ns: int, end_ns: int
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return Â and the covariance (6, 6) of ε to which :func:`advance` would lead."""
-    joint, axes = state.filter.joint, state.axes
-    if joint is None or core.COMPILED is None:  # in numpy the general way costs less
+    errors, axes = state.errors, state.axes
+    if errors is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
     # Landmarks have no part in it.
+    joint = errors.joint
     P = joint.P[: joint.first, : joint.first].copy()
     x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, joint.first, joint.first)
     status, out = _advanced(state, x, velocities, start_ns, end_ns)
@@ -161,7 +162,7 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
     before = x.A.copy()
     x.A[...] = out.A
     if len(out.shift):
-        state.filter.calibration.shift(out.shift)
+        state.calibration.shift(out.shift)
     state.rejected_in_a_row, state.was_contradicted = 0, False
     _record(state, event, seen, before, out)
     return Outcome(event.ids, out.r, np.zeros(m, dtype=np.bool_), _NO_IDS, _innovation(state, out))
@@ -169,7 +170,10 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
 
 def _estimate(state: State) -> Estimate | None:
     """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
-    joint, observer = state.filter.joint, state.observer
+    errors, observer = state.errors, state.observer
+    if errors is None:
+        return None
+    joint = errors.joint
     if type(joint) is not JointCovariance or joint.chart.stride > state.axes.point:
         return None
     if observer.have_moved:
@@ -183,7 +187,7 @@ def _estimate(state: State) -> Estimate | None:
 def _estimate_of(
     state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, size: int, first: int
 ) -> Estimate:
-    calibration = state.filter.calibration
+    calibration = state.calibration
     return Estimate(
         state.observer.A,
         y_ref,
@@ -202,7 +206,7 @@ def _advanced(
     state: State, x: Estimate, velocities: Velocities, start_ns: int, end_ns: int
 ) -> tuple[int, Advanced]:
     """Move ``x`` on along velocities (27); return whether that was usual, and what it did."""
-    calibration, p = state.filter.calibration, state.axes.p
+    calibration, p = state.calibration, state.axes.p
     interval = Interval(
         start_ns,
         end_ns,
@@ -229,7 +233,7 @@ def _seen(state: State, event: ObservationEvent) -> Seen | None:
         return None
     arms, covariances = _plain(event.lines_of_sight), event.covariances
     ids, origins = np.ascontiguousarray(event.ids, np.int64), event.sensor
-    calibration = state.filter.calibration
+    calibration = state.calibration
     values, estimated, column = None, _NO_IDS, 0
     if calibration.corrects_points:
         sensor = calibration.sensors.get(event.sensor_frame)
@@ -271,7 +275,7 @@ def _record(
         return
     sensed = None
     if seen.sensor is not None:
-        number = state.filter.calibration.sensors[event.sensor_frame].number
+        number = state.calibration.sensors[event.sensor_frame].number
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
     stated = out.covariances if len(out.covariances) else None

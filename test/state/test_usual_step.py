@@ -51,8 +51,8 @@ def parts(state):
     return {
         'A': state.observer.A,
         'a': state.observer.a,
-        'P': state.filter.joint.P,
-        'calibration': state.filter.calibration.values,
+        'P': state.errors.joint.P,
+        'calibration': state.calibration.values,
         'factors': np.concatenate([factors._logs, factors._information.ravel(), factors.applied]),
         'shares': np.zeros(()) if factors._shares is None else factors._shares,
         'noise': history._motion_noise,
