@@ -88,7 +88,7 @@ $(READY_TO_DEVELOP): $(READY) requirements-develop.lock
 	touch $@
 
 # Where there is a compiler; it was built with the rest at first, and is again when it changes.
-$(CORE): slam_observer_ros/observer/_core.c | $(READY)
+$(CORE): $(wildcard slam_observer_ros/observer/_*.[ch]) | $(READY)
 	$(PYTHON_IN_VENV) setup.py --quiet build_ext --inplace
 	touch $@
 

@@ -40,6 +40,7 @@ setup(
         Extension(
             f'{PACKAGE}.observer._core',
             [f'{PACKAGE}/observer/_core.c'],
+            depends=glob(f'{PACKAGE}/observer/_*.h'),
             extra_compile_args=['-O3', '-fno-math-errno'],
             optional=True,  # without a compiler numpy does the same
         )

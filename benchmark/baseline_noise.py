@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.sensor_models import sensing

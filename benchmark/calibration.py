@@ -21,15 +21,15 @@ from threadpoolctl import threadpool_limits
 import worlds
 from worlds import drive, Loop, simulated_settings, World
 
-from slam_observer_ros.cli.calibrate.finder import Finder
-from slam_observer_ros.cli.tune.material import Material
+from slam_observer_ros.cli.calibration_finder import Finder
+from slam_observer_ros.cli.held_out import Material
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
+from slam_observer_ros.evaluation.metrics import ConfigurationError
+from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap

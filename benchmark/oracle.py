@@ -20,7 +20,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 
 LEAST_SEEN = 4

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import worlds
 
-from slam_observer_ros.evaluation.plots.drawing import BLACK, BLUE, GREEN, PURPLE, RED, save, STYLE
+from slam_observer_ros.evaluation.drawing import BLACK, BLUE, GREEN, PURPLE, RED, save, STYLE
 
 FIGURES = worlds.CHECKOUT / 'benchmark' / 'performance.json'
 PAGE = worlds.CHECKOUT / 'docs' / 'performance.md'

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import resource
@@ -35,7 +37,7 @@ with AnyReader([Path(sys.argv[1])]) as reader:
 
 def measure_replay() -> Tables:
     """Return the CPU time of ``replay --json`` over that of reading the same recording."""
-    with tempfile.TemporaryDirectory() as folder:
+    with with_bytecode() as folder:
         recording = Path(folder) / 'robot1.mcap'
         data = worlds.data_folder() / 'mrclam' / 'MRCLAM_Dataset6'
         run([*COMMAND, 'convert', 'mrclam', '--robot', '1', str(data), str(recording)])
@@ -52,7 +54,8 @@ def measure_replay() -> Tables:
 
 def measure_start() -> Tables:
     """Return the CPU time of ``slam-observer --help`` over that of importing numpy."""
-    turns = take_turns([sys.executable, '-c', 'import numpy'], [*COMMAND, '--help'])
+    with with_bytecode():
+        turns = take_turns([sys.executable, '-c', 'import numpy'], [*COMMAND, '--help'])
     rows: dict[str, list[float | None]] = {'slam-observer --help': [over_first(turns, 1)]}
     return {'start': Table(columns=['over import numpy'], rows=rows)}
 
@@ -75,7 +78,22 @@ def measure_memory() -> Tables:
 
 def take_turns(*commands: list[str]) -> list[list[float]]:
     """Return the CPU times of programs that are run in turns, seconds: a list for each turn."""
-    return [[cpu_s(command) for command in commands] for _ in range(TURNS)]
+    turns = [[cpu_s(command) for command in commands] for _ in range(TURNS + 1)]
+    return turns[1:]  # without the first, which may write bytecode
+
+
+@contextmanager
+def with_bytecode() -> Iterator[str]:
+    """Let programs keep their bytecode, as installed ones have it, in a folder that is given."""
+    before = dict(os.environ)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
+        os.environ['PYTHONPYCACHEPREFIX'] = str(Path(folder) / 'bytecode')
+        try:
+            yield folder
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
 
 
 def over_first(turns: list[list[float]], number: int) -> float:

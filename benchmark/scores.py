@@ -9,8 +9,11 @@ from estimators import Run, Snapshot
 import numpy as np
 from worlds import World
 
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
-from slam_observer_ros.evaluation.metrics import landmark_errors, trajectory_errors
+from slam_observer_ros.evaluation.metrics import (
+    ConfigurationError,
+    landmark_errors,
+    trajectory_errors,
+)
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import ObservationEvent
 

@@ -14,7 +14,7 @@ import sys
 
 import numpy as np
 
-from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3

@@ -20,7 +20,7 @@ from worlds import drive, Loop, simulated_settings, World
 from slam_observer_ros.common.threads import use_one_thread
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.sensor_models.calibration import without_calibration

@@ -20,7 +20,7 @@ import worlds
 from worlds import World
 
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.events import ObservationEvent
 

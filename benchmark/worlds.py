@@ -14,14 +14,14 @@ import numpy as np
 from odometry import Event
 
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.datasets.data_set import DataSet
-from slam_observer_ros.recording.datasets.graph import load_graph
-from slam_observer_ros.recording.datasets.mrclam import load_mrclam
-from slam_observer_ros.recording.datasets.starry_night import load_starry_night
+from slam_observer_ros.recording.graph_files import load_graph
+from slam_observer_ros.recording.mrclam import load_mrclam
+from slam_observer_ros.recording.starry_night import load_starry_night
+from slam_observer_ros.recording.writer import DataSet
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise

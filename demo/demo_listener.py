@@ -16,8 +16,8 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from std_msgs.msg import Float64
 from visualization_msgs.msg import MarkerArray
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.clouds import decode_point_cloud, decode_point_cloud2

@@ -15,8 +15,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from tf2_msgs.msg import TFMessage
 
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.message_classes import MESSAGES

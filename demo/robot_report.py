@@ -8,7 +8,7 @@ from hall_robot import error_of, Estimated, HallRobot, Seen
 import numpy as np
 from rich.console import Console
 
-from slam_observer_ros.common.tables import table_of
+from slam_observer_ros.cli.console import table_of
 from slam_observer_ros.common.types import FloatArray
 
 ENOUGH_TAGS, ENOUGH_REFLECTORS = 2, 6  # in view, by which the robot is found

@@ -5,15 +5,13 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from slam_observer_ros.common.version import VERSION
-
 if TYPE_CHECKING:
     from slam_observer_ros.estimator.estimator import Estimator
     from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
     from slam_observer_ros.known_map.landmark_map import LandmarkMap
     from slam_observer_ros.settings.estimator_settings import Settings
 
-__version__ = VERSION
+__version__ = '0.1.0'
 
 __all__ = [
     'AngularVelocityEvent',

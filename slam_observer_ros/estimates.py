@@ -37,10 +37,10 @@ def point_share(counts: Counter[str], name: str) -> float:
 class NormalisedInnovation:
     """Residuals of m landmarks, judged by what the filter expected of them before the correction.
 
-    ``nis`` is the normalised innovation squared of those that were used, together: χ² of so many
+    ``nis`` is the normalised innovation squared of all that were used, together: χ² of so many
     ``degrees_of_freedom`` where all noise is as stated; None where no joint covariance is known.
     ``log_densities`` are natural logarithms of what the filter expected, of each residual given
-    those used before it, in 1/m^k; −∞ of those that were not used. ``shares`` are below 1 for
+    all used before it, in 1/m^k; −∞ where it was not used. ``shares`` are below 1 for
     observations whose error has not changed since the last one.
     """
 
@@ -97,7 +97,7 @@ class CalibrationEstimate:
         return math.degrees(1.0), self.unit.replace('rad', '°', 1)
 
     def __str__(self) -> str:
-        """Write it with its uncertainty, of which at least two digits can be seen."""
+        """Write it with its uncertainty, at least two digits of it."""
         factor, unit = self.for_people
         value, deviation = factor * self.value, factor * self.deviation
         digits = 3

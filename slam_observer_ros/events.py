@@ -28,7 +28,7 @@ IMPOSSIBLE_ID = -(2**31)
 """Landmark id of a point whose message has a number there that can't be one: it is not used."""
 
 MAX_ID = 2**32 - 2
-"""Largest landmark id: those that go out are uint32, whose last one says that it is unknown."""
+"""Largest landmark id: they go out as uint32, whose last one says that it is unknown."""
 
 FIRST_AUTOMATIC_ID = 10_000_000
 """Landmarks whose sensor gives no ids are numbered from here on."""
@@ -74,18 +74,27 @@ class VelocityEvent:
         return replace(self, body_velocity=Ad @ self.body_velocity, covariance=covariance)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # not frozen, which would take a microsecond more
 class VelocityBlock:
-    """k velocity events that came one after the other, as arrays: cheaper to handle together."""
+    """k velocity events that came one after the other, as arrays; a single one is a block of one.
+
+    ``is_mean`` is that of all of them.
+    """
 
     stamps_ns: IntArray  # (k,)
     body_velocities: FloatArray  # (k, 6)
     covariances: FloatArray | None = None  # (k, 6, 6), all of them stated
     receive_ns: IntArray | None = None  # (k,)
     sensor_frame: str = ''
+    is_mean: bool = False
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @property
+    def stamp_ns(self) -> int:
+        """That of the first one."""
+        return int(self.stamps_ns[0])
 
     def part(self, rows: slice) -> VelocityBlock:
         """Return some of them."""
@@ -95,16 +104,21 @@ class VelocityBlock:
             None if self.covariances is None else self.covariances[rows],
             None if self.receive_ns is None else self.receive_ns[rows],
             self.sensor_frame,
+            self.is_mean,
         )
 
+    def one_by_one(self) -> list[VelocityBlock]:
+        """Return them as blocks of one."""
+        return [self.part(slice(row, row + 1)) for row in range(len(self))]
+
     def events(self) -> Iterator[VelocityEvent]:
-        """Yield them one by one."""
+        """Yield them as events."""
         received = [None] * len(self) if self.receive_ns is None else self.receive_ns.tolist()
         covariances = [None] * len(self) if self.covariances is None else self.covariances
         for columns in zip(
             self.stamps_ns.tolist(), self.body_velocities, covariances, received, strict=True
         ):
-            yield VelocityEvent(*columns, sensor_frame=self.sensor_frame)
+            yield VelocityEvent(*columns, self.is_mean, self.sensor_frame)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +215,25 @@ Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
 """Anything that :meth:`slam_observer_ros.estimator.estimator.Estimator.add` takes."""
 
 
+Queued: TypeAlias = VelocityBlock | AngularVelocityEvent | ObservationEvent
+"""What is put in order of stamps, and then used: velocities together."""
+
+
+def queued(event: Event) -> Queued:
+    """Return an event as what is put in order; a velocity is a block of one."""
+    if not isinstance(event, VelocityEvent):
+        return event
+    covariance, receive_ns = event.covariance, event.receive_ns
+    return VelocityBlock(
+        np.array([event.stamp_ns], dtype=np.int64),
+        event.body_velocity[None],
+        None if covariance is None else covariance[None],
+        None if receive_ns is None else np.array([receive_ns], dtype=np.int64),
+        event.sensor_frame,
+        event.is_mean,
+    )
+
+
 def is_automatic(ids: IntArray) -> BoolArray:
     """Return which ids (m,) were given to landmarks whose sensor gives none."""
     automatic: BoolArray = (ids >= FIRST_AUTOMATIC_ID) & (ids <= LAST_AUTOMATIC_ID)
@@ -224,7 +257,7 @@ def flatten_velocities(body_velocities: FloatArray) -> FloatArray:
 
 
 def _turned(covariances: FloatArray, R: FloatArray) -> FloatArray:
-    """Return R C Rᵀ of covariances (…, d, d), none of which is larger than unknown."""
+    """Return R C Rᵀ of covariances (…, d, d), and no larger than unknown ones."""
     largest = np.full(len(R), MAX_DEVIATION)
     turned: FloatArray = R @ limited(covariances, largest) @ R.T
     return turned

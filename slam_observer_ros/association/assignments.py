@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     JointSearch,
@@ -24,7 +25,6 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.landmark_index import LandmarkIndex
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3

@@ -15,7 +15,9 @@ from slam_observer_ros.association.joint_compatibility import (
     joint_cost,
     unpaired_cost,
 )
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import gated
@@ -84,3 +86,44 @@ def cost_of_staying(state: State, matched: MatchedObservation) -> tuple[BoolArra
     again, shifts = rejected_before(state, matched)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
     return again, np.minimum(costs, outlier_cost(state))
+
+
+MEMORY_S = 60.0
+"""Time, seconds, after which what was seen counts for a third."""
+
+RARE_SHARE = 0.0017
+"""Share of points that are of new landmarks at which one costs as much as a point at the gate."""
+
+SHARE_AT_FIRST, POINTS_AT_FIRST = 0.05, 10.0
+"""The share as it is taken to be before anything was seen, and how many points that counts for."""
+
+LEAST_COST = 9.0
+"""What a new landmark costs at least: else many a true pair, beyond 3 σ, would cost more."""
+
+
+class NewLandmarks:
+    """What it costs to take a point for a new landmark; −2 ln of a likelihood.
+
+    On new ground many points are of new landmarks, and one that could only just be of a known one
+    is not. Where all is known it hardly ever is a new one.
+    """
+
+    def __init__(self) -> None:
+        self._points = self._new = 0.0  # of late
+        self._stamp_ns: int | None = None
+
+    def cost(self, gate_cost: float) -> float:
+        """Return the cost; ``gate_cost`` is that of a point at the gate, and the most."""
+        share = (self._new + SHARE_AT_FIRST * POINTS_AT_FIRST) / (self._points + POINTS_AT_FIRST)
+        cost = gate_cost - 2.0 * math.log(share / RARE_SHARE)
+        return min(max(cost, min(LEAST_COST, gate_cost)), gate_cost)
+
+    def note(self, event: ObservationEvent, confirmed: int) -> None:
+        """Count an observation, and how many landmarks it ``confirmed``."""
+        if self._stamp_ns is not None:
+            decay = math.exp(-max(to_s(event.stamp_ns - self._stamp_ns), 0.0) / MEMORY_S)
+            self._points *= decay
+            self._new *= decay
+        self._stamp_ns = event.stamp_ns
+        self._points += len(event.ids)
+        self._new += confirmed

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.association.contradictions import Contradictions
+from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     Interpretation,
@@ -29,7 +29,7 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.new_landmarks import NewLandmarks
+from slam_observer_ros.association.slip import Contradictions
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME

@@ -24,7 +24,7 @@ from slam_observer_ros.association.costs import (
     rejection_cost,
     SLIP_COST,
 )
-from slam_observer_ros.association.landmark_index import LandmarkIndex
+from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID

@@ -16,8 +16,8 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import block_diag
 
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
@@ -208,7 +208,7 @@ class Standing:
     """Whether the robot stands while its wheels spin, and which landmarks it carries along."""
 
     carried: set[int] = field(default_factory=set)
-    excluded: set[int] = field(default_factory=set)  # that may be carried, and those that are
+    excluded: set[int] = field(default_factory=set)  # landmarks that are carried, or may be
     slip: int | None = None  # which of the SLIPS goes on
     moved: list[Move] = field(default_factory=list)  # by odometry, since a start …
     sensor_frame: str = ''  # an observation is due from another one, …

@@ -10,31 +10,31 @@ from pathlib import Path
 import re
 
 from slam_observer_ros.cli.console import print_columns, print_json
-from slam_observer_ros.cli.figures import (
-    ACCURACY_ROWS,
-    FIGURES,
-    number_text,
-    TRAJECTORY_ROWS,
-)
 from slam_observer_ros.cli.options import add_settings_options, named, named_path, read_given
 from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
-from slam_observer_ros.cli.replay.request import (
+from slam_observer_ros.cli.replay_request import (
     add_run_options,
     read_request,
     Records,
     ReplayRequest,
 )
-from slam_observer_ros.cli.replay.run import replayed, select_inputs
-from slam_observer_ros.cli.replay.summary import as_json, NEARLY_ALL
+from slam_observer_ros.cli.replay_run import replayed, select_inputs
+from slam_observer_ros.cli.replay_summary import as_json, NEARLY_ALL
 from slam_observer_ros.common.errors import EvaluationError, UsageError
+from slam_observer_ros.evaluation.drawing import SUFFIXES
+from slam_observer_ros.evaluation.map_plot import plot_overlay
 from slam_observer_ros.evaluation.metrics import trajectory_errors
-from slam_observer_ros.evaluation.plots.drawing import SUFFIXES
-from slam_observer_ros.evaluation.plots.map_plot import plot_overlay
 from slam_observer_ros.evaluation.relative_errors import trajectory_figures
 from slam_observer_ros.evaluation.trajectory import read_tum, Trajectory
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.accuracy import (
+    ACCURACY_ROWS,
+    FIGURES,
+    number_text,
+    TRAJECTORY_ROWS,
+)
 from slam_observer_ros.settings.input_settings import InputSettings
 
 _ROWS = list(TRAJECTORY_ROWS)

@@ -1,4 +1,4 @@
-"""What the user sees: messages and progress on standard error, results on standard output."""
+"""What the command line says: results on standard output, messages and progress beside them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from contextlib import contextmanager
 import logging
 import sys
 import threading
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from slam_observer_ros.cli.shell import leaving_at_once
 from slam_observer_ros.common.digits import json_text
+from slam_observer_ros.common.findings import Finding
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 PROGRAM = 'slam-observer'
 
@@ -29,21 +33,24 @@ class MessageHandler(logging.Handler):
 
 
 class _Keeper(logging.Handler):
-    """Keeps the warnings, as text."""
+    """Keeps the warnings: findings, and others as text."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self.warnings: list[str] = []
+        self.warnings: list[Finding | str] = []
         self._thread = threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep one record, unless another thread's run gave it."""
-        if record.thread == self._thread:
-            self.warnings.append(' '.join(record.getMessage().split()))
+        if record.thread != self._thread:
+            return
+        first = record.args[0] if isinstance(record.args, tuple) and record.args else None
+        text = ' '.join(record.getMessage().split())
+        self.warnings.append(first if isinstance(first, Finding) else text)
 
 
 @contextmanager
-def kept_warnings() -> Iterator[list[str]]:
+def kept_warnings() -> Iterator[list[Finding | str]]:
     """Give a list that the package's warnings are added to, beside being shown."""
     keeper, package_logger = _Keeper(), logging.getLogger('slam_observer_ros')
     package_logger.addHandler(keeper)
@@ -153,8 +160,6 @@ def print_table(title: str, rows: Mapping[str, str]) -> None:
     with leaving_at_once():
         from rich.console import Console
 
-        from slam_observer_ros.common.tables import table_of
-
     Console(highlight=False, markup=False).print(table_of(title, rows))
 
 
@@ -166,8 +171,7 @@ def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[s
     with leaving_at_once():
         from rich.cells import cell_len
         from rich.console import Console
-
-        from slam_observer_ros.common.tables import columns_of
+        from rich.table import Table
 
     console = Console(highlight=False, markup=False)
     columns = list(zip(headings, *rows, strict=True))
@@ -179,5 +183,24 @@ def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[s
         else:
             tables.append([0, number])
     for table in tables:
+        shown = Table(title=title, title_justify='left')
         headings, *lines = zip(*(columns[number] for number in table), strict=True)
-        console.print(columns_of(title, headings, [line for line in lines if any(line[1:])]))
+        for number, heading in enumerate(headings):
+            shown.add_column(heading, overflow='fold', justify='right' if number else 'left')
+        for line in lines:
+            if any(line[1:]):
+                shown.add_row(*line)
+        console.print(shown)
+
+
+def table_of(title: str, rows: Mapping[str, str]) -> Table:
+    """Return a table of names and values; a narrow terminal folds it and shortens nothing."""
+    with leaving_at_once():
+        from rich.table import Table
+
+    table = Table(title=title, title_justify='left', show_header=False)
+    for _ in ('name', 'value'):
+        table.add_column(overflow='fold')
+    for name, value in rows.items():
+        table.add_row(name, value)
+    return table

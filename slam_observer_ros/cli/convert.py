@@ -15,10 +15,10 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
-from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
-from slam_observer_ros.recording.datasets.graph import load_graph
-from slam_observer_ros.recording.datasets.mrclam import load_mrclam
-from slam_observer_ros.recording.datasets.starry_night import load_starry_night
+from slam_observer_ros.recording.graph_files import load_graph
+from slam_observer_ros.recording.mrclam import load_mrclam
+from slam_observer_ros.recording.starry_night import load_starry_night
+from slam_observer_ros.recording.writer import DataSet, write_data_set
 
 GRAPH_PARAMETERS = """\
 # A graph in the plane: the second that a pose takes is only a name for its step.

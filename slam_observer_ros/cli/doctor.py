@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import print_json, print_table
 from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _installed() -> dict[str, str]:
     found = {
-        'slam_observer_ros': VERSION,
+        'slam_observer_ros': __version__,
         'Python': f'{platform.python_version()} ({sys.executable})',
         'ROS': _ros(),
         'step of the filter': core.description(),

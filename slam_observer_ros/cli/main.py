@@ -17,6 +17,7 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
+    from slam_observer_ros import __version__
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
     from slam_observer_ros.cli.shell import complete, typed_words
     from slam_observer_ros.common.errors import (
@@ -26,7 +27,6 @@ with leaving_at_once():
         SlamObserverError,
     )
     from slam_observer_ros.common.threads import use_one_thread
-    from slam_observer_ros.common.version import VERSION
     from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2
@@ -39,13 +39,13 @@ COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
     'map': ('map', 'make a map file of a map of another program, or check one'),
-    'replay': ('replay.command', 'run a recording through the observer'),
-    'calibrate': ('calibrate.command', 'find how sensor and odometry err, by a drive'),
-    'tune': ('tune.command', 'find the noise figures that a recording shows'),
+    'replay': ('replay', 'run a recording through the observer'),
+    'calibrate': ('calibrate', 'find how sensor and odometry err, by a drive'),
+    'tune': ('tune', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),
     'doctor': ('doctor', 'say what is installed, and what a node would hear'),
     'compare': ('compare', 'put runs, gains and TUM files on one recording side by side'),
-    'batch': ('batch.command', 'run many recordings with many settings'),
+    'batch': ('batch', 'run many recordings with many settings'),
 }
 """The module of each command, and what it does; only the one that is given is imported."""
 
@@ -95,7 +95,7 @@ def make_parser(arguments: Sequence[str]) -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument('--version', action='version', version=f'{PROGRAM} {VERSION}')
+    parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     given = next((word for word in arguments if not word.startswith('-')), None)
     for name, (module, help_text) in COMMANDS.items():

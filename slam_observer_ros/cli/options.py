@@ -173,7 +173,7 @@ def find_config(name: str) -> Path:
     if path.suffix:
         return path
     raise ParameterError(
-        f"no parameter file '{name}'; those that come with the package: "
+        f"no parameter file '{name}'; with the package come: "
         f'{", ".join(shipped_names()) or "none"}'
     )
 

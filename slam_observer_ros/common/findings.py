@@ -116,6 +116,60 @@ KINDS = {
         '{path}: damaged; {loss}',
         'record it again if what is lost matters; --strict refuses such recordings',
     ),
+    'incomplete_recording': Kind(
+        Level.WARNING,
+        '{problem}',
+        'record it again if what is lost matters; --strict refuses such recordings',
+    ),
+    'malformed_message': Kind(
+        Level.WARNING,
+        '{path}: malformed message on {topic}: {error}',
+        'see whether all of them are, by the count of these (Troubleshooting)',
+    ),
+    'several_robots': Kind(
+        Level.WARNING,
+        'no transforms are used: those on {topics} are of several robots, and none of them is in '
+        'the namespace that {inputs} share',
+        'only replay topics of one namespace, or set sensor_pose',
+    ),
+    'guessed_base': Kind(
+        Level.WARNING,
+        "the velocities don't say whose they are: '{frame}', the landmarks' frame, is taken for "
+        'the robot',
+        'set another by --base-frame',
+    ),
+    'unread_truth': Kind(
+        Level.WARNING,
+        'named like ground truth, but not of a type that true poses are read of ({types}): '
+        '{topics}',
+        'record it as one of these, or do without',
+    ),
+    'truth_frame': Kind(
+        Level.WARNING,
+        "the true poses are of '{frame}', and the estimated ones of '{base_frame}': they are "
+        'compared as if that were one frame ({error})',
+        'record the transform between them, or set --base-frame',
+    ),
+    'uncompared': Kind(
+        Level.WARNING,
+        'the {figure} is not compared with the truth: {error}',
+        'see whether truth and estimate are of the same time and place',
+    ),
+    'unknown_anees': Kind(
+        Level.WARNING, 'the ANEES is not known: {error}', 'record the truth from the start on'
+    ),
+    # Transforms
+    'unused_transform': Kind(
+        Level.WARNING,
+        "a transform on /tf of frame '{frame}' is not used: {reason}",
+        'see what publishes it; the other transforms of the message are used',
+    ),
+    'velocity_frame': Kind(
+        Level.WARNING,
+        "velocities in frame '{frame}' are taken to be those of '{base_frame}' until their "
+        'transform is known: {error}',
+        'let /tf or /tf_static have it',
+    ),
     'zero_twist': Kind(
         Level.WARNING,
         'all velocities on {topic} are zero, but its poses move',
@@ -189,7 +243,7 @@ KINDS = {
     'left_out_points': Kind(
         Level.WARNING,
         'of {count} points seen {reasons}',
-        'see under Troubleshooting what these mean; ids are those that the sensor gives',
+        'see under Troubleshooting what these mean; ids are what the sensor gives',
     ),
     'point_noise': Kind(
         Level.NOTE,
@@ -251,6 +305,19 @@ KINDS = {
         'was moved, or it is in the map twice now',
         'if it was not moved, state more noise of the velocity or of the points (Tune the noise)',
     ),
+    # A loaded map
+    'flat_map': Kind(
+        Level.WARNING,
+        'the map was made with two_d_mode, which is off: in space its heights of zero are taken '
+        'for exact',
+        'use two_d_mode: true for a robot on a floor',
+    ),
+    'symmetric_map': Kind(
+        Level.WARNING,
+        'the map{name} is the same turned by {turn_deg:.0f}°{but}: without ids or a start pose '
+        'the robot {consequence}',
+        'add one more landmark: at ({x:.1f} m, {y:.1f} m) it would do',
+    ),
     # Events, as they come; the log has how many of each
     'dropped_message': Kind(
         Level.WARNING, 'dropped a message, {reason}: {error}', 'see Troubleshooting for the reason'
@@ -304,13 +371,13 @@ KINDS = {
         Level.WARNING,
         'the map has {count} landmarks. Where they move, time and memory that riccati gains take '
         'grow with their square: 70 ms a step and 0.5 GB for 600 landmarks in space',
-        'max_landmarks limits them; landmark_velocity_stddev: 0.0 is for those at rest, of which '
-        'many cost no more than few',
+        'max_landmarks limits them; landmark_velocity_stddev: 0.0 is for landmarks at rest: many '
+        'of these cost no more than few',
     ),
     'loaded_map': Kind(
         Level.WARNING,
-        'the loaded map has {count} landmarks, and max_landmarks is {limit}: those that are not '
-        'seen make room for new ones',
+        'the loaded map has {count} landmarks, and max_landmarks is {limit}: what is not seen of '
+        'it makes room for new ones',
         'to keep them, set it higher, or localization_mode: uncertain',
     ),
     'left_out_correlations': Kind(
@@ -358,6 +425,9 @@ class Finding:
     remedy: str
     start_s: float | None = None
     end_s: float | None = None
+
+    def __str__(self) -> str:
+        return self.text()
 
     def text(self, note: str = '') -> str:
         """Return it as a sentence, with a note behind what is wrong."""

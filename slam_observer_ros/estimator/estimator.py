@@ -12,8 +12,8 @@ import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
 from slam_observer_ros.estimator.checks import (
     check_event,
@@ -29,15 +29,16 @@ from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
     ObservationEvent,
+    Queued,
+    queued,
     UNKNOWN_ID,
     VelocityBlock,
-    VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
+from slam_observer_ros.known_map.merging import map_of
 from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
@@ -228,19 +229,10 @@ class Estimator:
         """
         try:
             check_event(event, self.settings)
-            passes = self._queue.passes(event)
-            jumped = not passes and self._queue.push(event)
+            self._take(queued(event))
         except InvalidEventError as error:
             self._drop(error)
             return False
-        if passes:  # as nearly always
-            self._process(event)
-            return True
-        if jumped:
-            self.handle_clock_jump(event.stamp_ns - (self.newest_stamp_ns or 0))
-            self._queue.push(event)
-        for ready in self._queue.pop_ready():
-            self._process(ready)
         return True
 
     def add_velocities(self, velocities: VelocityBlock) -> int:
@@ -248,11 +240,29 @@ class Estimator:
 
         All is bit for bit as if they were added one by one; it only takes less time.
         """
-        if not self._push_velocities(velocities):
+        if not self._are_usual(velocities):
             return sum(self.add(event) for event in velocities.events())
+        self._take(velocities)
+        return len(velocities)
+
+    def _are_usual(self, velocities: VelocityBlock) -> bool:
+        """Return whether none of the velocities needs to be looked at for itself."""
+        try:
+            check_velocities(velocities, self.settings)
+        except InvalidEventError:
+            return False
+        return self._queue.follow(velocities)
+
+    def _take(self, item: Queued) -> None:
+        """Use what is right in itself, in its order; InvalidEventError if its stamp is not."""
+        if self._queue.passes(item):  # as nearly always
+            self._process(item)
+            return
+        if self._queue.push(item):
+            self.handle_clock_jump(item.stamp_ns - (self.newest_stamp_ns or 0))
+            self._queue.push(item)
         for ready in self._queue.pop_ready():
             self._process(ready)
-        return len(velocities)
 
     def release(self, limit_s: float = math.inf) -> None:
         """Use the events that are held back for others, as before something is changed.
@@ -262,7 +272,7 @@ class Estimator:
         """
         end_s = time.monotonic() + limit_s
         for ready in self._queue.pop_believed():
-            events = ready.events() if isinstance(ready, VelocityBlock) else (ready,)
+            events = ready.one_by_one() if isinstance(ready, VelocityBlock) else (ready,)
             for event in events:
                 if time.monotonic() > end_s:
                     self._drop(InvalidEventError('stopped', 'held back when the end came'))
@@ -487,55 +497,44 @@ class Estimator:
         self.dropped[error.reason] += 1
         self._warnings.warn('dropped_message', error.reason, reason=error.reason, error=error)
 
-    def _push_velocities(self, velocities: VelocityBlock) -> bool:
-        """Put velocities in the queue if none of them needs to be looked at for itself."""
-        try:
-            check_velocities(velocities, self.settings)
-        except InvalidEventError:
-            return False
-        return self._queue.push_velocities(velocities)
-
-    def _process_velocities(self, velocities: VelocityBlock) -> None:
-        """Use velocities, as far as possible at once."""
-        if not self._timeline.takes(velocities):
-            for event in velocities.events():
-                self._process(event)
+    def _process(self, item: Queued) -> None:
+        """Use what has its turn: what is of one stamp, or velocities that follow each other."""
+        if isinstance(item, VelocityBlock):
+            for part in self._timeline.parts(item):
+                self._report_before(part.stamp_ns)
+                self._process_velocities(part, len(part))
+                if self._on_stamps is not None and len(part) > 1:
+                    self._on_stamps(part.stamps_ns[:-1])
+                self._timeline.advance_after_many()
             return
-        while len(velocities):
-            room = self._timeline.room
-            now, velocities = velocities.part(slice(room)), velocities.part(slice(room, None))
-            self._report_stamp()
-            self._timeline.append_velocities(now)
-            self._counts['velocity'] += len(now)
-            if self._on_stamps is not None and len(now) > 1:
-                self._on_stamps(now.stamps_ns[:-1])
+        self._report_before(item.stamp_ns)
+        if isinstance(item, ObservationEvent):
+            self._process_observation(item)
+        else:
+            self._process_velocities(item, 1)
             self._timeline.advance_after_many()
 
-    def _process(self, event: Event | VelocityBlock) -> None:
-        if isinstance(event, VelocityBlock):
-            self._process_velocities(event)
-            return
-        if self._on_stamps is not None and event.stamp_ns > (self.stamp_ns or 0):
+    def _report_before(self, stamp_ns: int) -> None:
+        """Report the present stamp if the next event is of a later one."""
+        if self._on_stamps is not None and stamp_ns > (self.stamp_ns or 0):
             self._report_stamp()
-        if isinstance(event, ObservationEvent):
-            self._process_observation(event)
-        else:
-            self._process_velocity(event)
 
     def _report_stamp(self) -> None:
         """Report that all events of the present stamp have been used."""
         if self._on_stamps is not None and self.stamp_ns is not None:
             self._on_stamps(np.array([self.stamp_ns]))
 
-    def _process_velocity(self, event: VelocityEvent | AngularVelocityEvent) -> None:
-        is_late = self._timeline.is_late(event)
+    def _process_velocities(
+        self, measured: VelocityBlock | AngularVelocityEvent, count: int
+    ) -> None:
+        is_late = self._timeline.is_late(measured)
         try:
-            is_used = self._timeline.append(event)
+            is_used = self._timeline.append(measured)
         except InvalidEventError as error:
             self._drop(error)
             return
         if is_used:
-            self._counts['velocity'] += 1
+            self._counts['velocity'] += count
         if is_late:
             self._counts['late_velocity'] += 1
             self._warnings.warn('late_velocity')

@@ -6,23 +6,15 @@ from collections import deque
 from hashlib import blake2b
 import heapq
 from itertools import repeat
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import InvalidEventError
-from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import (
-    AngularVelocityEvent,
-    Event,
-    ObservationEvent,
-    VelocityBlock,
-    VelocityEvent,
-)
+from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
+from slam_observer_ros.events import AngularVelocityEvent, Queued, VelocityBlock
 
 Key: TypeAlias = tuple[int, bool, bytes]
-Ready: TypeAlias = Event | VelocityBlock
 
 RECENT = 1000
 """Events from which it is known how far ahead of their reception stamps are.
@@ -93,8 +85,8 @@ class EventQueue:
         self._lead_ns = 0
         self.newest_ns: int | None = None  # newest stamp that is believed
 
-    def push(self, event: Event) -> bool:
-        """Take an event; return whether it shows that the clock has jumped.
+    def push(self, event: Queued) -> bool:
+        """Take an event, or velocities that :meth:`follow`; return whether the clock has jumped.
 
         Raise :exc:`InvalidEventError` if the stamp is far from all others (``'stamp_jump'``,
         ``'too_late'``), or the event is already known (``'duplicate'``).
@@ -111,7 +103,8 @@ class EventQueue:
             return False
         if too_late or self._is_too_early(event):
             # Far away: refused, and counted if it is a sign of a jump.
-            is_no_jump = too_late and (self._is_newest_of_kind(event) or self._is_held_up(event))
+            is_newest = too_late and self._is_newest_of_kind(event, event.stamp_ns)
+            is_no_jump = is_newest or (too_late and self._is_held_up(event))
             if not is_no_jump and self._count_stray(event.stamp_ns, self.newest_ns):
                 return True
             raise _refusal(ahead_ns)
@@ -119,7 +112,7 @@ class EventQueue:
         self._take_ahead(event, self.newest_ns)
         return False
 
-    def passes(self, event: Event) -> bool:
+    def passes(self, event: Queued) -> bool:
         """Take an event that need not wait, and nothing waits for; return whether it is one.
 
         That is what :meth:`push` and :meth:`pop_ready` do with an event that is in time and the
@@ -130,65 +123,53 @@ class EventQueue:
             return False
         if not 0 < event.stamp_ns - newest_ns <= self._usual_ns:
             return False
-        if not self._events.note(_key(event), newest_ns - self._reach_ns):
+        if not self._events.note(_keys(event), newest_ns - self._reach_ns):
             return False
         self._note_in_time(event, newest_ns)
         return True
 
-    def push_velocities(self, velocities: VelocityBlock) -> bool:
-        """Take velocities if :meth:`push` would find each of them in time, and newest of all.
-
-        Return whether it would; if not, none is taken.
-        """
+    def follow(self, velocities: VelocityBlock) -> bool:
+        """Return whether velocities are unknown, in time, and each is the newest of all."""
         if self.newest_ns is None:
             return False
         steps_ns = np.diff(velocities.stamps_ns, prepend=self.newest_ns)
         if steps_ns.min() <= 0 or steps_ns.max() > self._least_usual_ns:
             return False
-        newest_ns = int(velocities.stamps_ns[-1])
-        before_ns = newest_ns - int(steps_ns[-1])
-        if not self._events.insert_velocities(velocities, before_ns - self._reach_ns):
-            return False
-        self._reception.note_velocities(velocities)
-        self._window.note(newest_ns, before_ns)
-        self._newest_of_kind_ns[VelocityEvent] = newest_ns
-        self._strays.clear()
-        self._believe(newest_ns, before_ns)
-        return True
+        return self._events.known.isdisjoint(_keys(velocities))
 
-    def pop_ready(self) -> list[Ready]:
+    def pop_ready(self) -> list[Queued]:
         """Return, in order, the events that have left the window."""
         return self._events.pop_until((self.newest_ns or 0) - self._window.length_ns)
 
-    def pop_believed(self) -> list[Ready]:
+    def pop_believed(self) -> list[Queued]:
         """Return, in order, all events but those with a stamp that waits for others."""
         return self._events.pop_until(self.newest_ns or 0)
 
-    def pop_all(self) -> list[Ready]:
+    def pop_all(self) -> list[Queued]:
         """Return all events that are left, in order."""
         return self._events.pop_all()
 
-    def _take_in_time(self, event: Event, newest_ns: int) -> None:
+    def _take_in_time(self, event: Queued, newest_ns: int) -> None:
         self._events.insert(event, newest_ns - self._reach_ns)
         self._note_in_time(event, newest_ns)
 
-    def _note_in_time(self, event: Event, newest_ns: int) -> None:
-        stamp_ns = event.stamp_ns
-        if event.receive_ns is not None:
-            self._reception.note(stamp_ns, event.receive_ns)
-        self._window.note(stamp_ns, newest_ns)
-        self._is_newest_of_kind(event)
+    def _note_in_time(self, event: Queued, newest_ns: int) -> None:
+        stamp_ns, before_ns = event.stamp_ns, newest_ns
+        if isinstance(event, VelocityBlock) and len(event) > 1:
+            before_ns, stamp_ns = event.stamps_ns[-2:].tolist()
+        self._reception.note(event)
+        self._window.note(stamp_ns, before_ns)
+        self._is_newest_of_kind(event, stamp_ns)
         if self._strays.last_ns is not None:
             self._strays.clear()
-        self._believe(stamp_ns if stamp_ns > newest_ns else newest_ns, newest_ns)
+        self._believe(stamp_ns if stamp_ns > before_ns else before_ns, before_ns)
 
-    def _take_ahead(self, event: Event, newest_ns: int) -> None:
+    def _take_ahead(self, event: Queued, newest_ns: int) -> None:
         """Keep an event far ahead; believe its stamp if enough agree."""
         self._events.insert(event, newest_ns - self._reach_ns)
         self._lead_ns = max(self._lead_ns, event.stamp_ns)
         if self._count_stray(event.stamp_ns, newest_ns):
-            if event.receive_ns is not None:
-                self._reception.note(event.stamp_ns, event.receive_ns)
+            self._reception.note(event)
             self._believe(self._lead_ns, newest_ns)
 
     def _believe(self, stamp_ns: int, newest_ns: int) -> None:
@@ -198,23 +179,23 @@ class EventQueue:
             self._usual_ns = usual_ns if usual_ns < self._max_jump_ns else self._max_jump_ns
         self.newest_ns = self._lead_ns = stamp_ns
 
-    def _is_too_early(self, event: Event) -> bool:
+    def _is_too_early(self, event: Queued) -> bool:
         """Return whether a stamp is further ahead than a pause, or silence, can explain."""
         if event.stamp_ns <= self._lead_ns + self._max_jump_ns:
             return False
         expected_ns = self._reception.expected_ns(event)
         return expected_ns is None or event.stamp_ns > expected_ns + self._max_jump_ns
 
-    def _is_newest_of_kind(self, event: Event) -> bool:
+    def _is_newest_of_kind(self, event: Queued, stamp_ns: int) -> bool:
         """Note the stamp if it is the newest of its kind; if not, that kind has gone back."""
-        kind, stamp_ns = type(event), event.stamp_ns
+        kind = type(event)
         newest_ns = self._newest_of_kind_ns.get(kind)
         if newest_ns is not None and stamp_ns <= newest_ns:
             return False
         self._newest_of_kind_ns[kind] = stamp_ns
         return True
 
-    def _is_held_up(self, event: Event) -> bool:
+    def _is_held_up(self, event: Queued) -> bool:
         """Return whether an event was received right after one that was in time."""
         since_ns = self._reception.since_in_time_ns(event)
         return since_ns is not None and 0 <= since_ns < HELD_UP_NS
@@ -259,74 +240,56 @@ class _SortedEvents:
     """Events in stamp order, each of them once."""
 
     def __init__(self) -> None:
-        self._heap: list[tuple[Key, Event]] = []
-        self._blocks: deque[VelocityBlock] = deque()  # each behind the end of the one before
+        self._heap: list[tuple[Key, Queued]] = []  # by the first key of each
         self.known: set[Key] = set()
         self._most_known = MIN_KNOWN
 
-    def insert(self, event: Event, oldest_ns: int) -> None:
+    def insert(self, event: Queued, oldest_ns: int) -> None:
         """Add an event; raise InvalidEventError if it is known. None before ``oldest_ns`` come."""
-        key = _key(event)
-        if not self.note(key, oldest_ns):
+        keys = _keys(event)
+        if not self.note(keys, oldest_ns):
             raise InvalidEventError('duplicate', 'this event is already known')
-        heapq.heappush(self._heap, (key, event))
+        heapq.heappush(self._heap, (keys[0], event))
 
-    def note(self, key: Key, oldest_ns: int) -> bool:
-        """Note an event, that is used at once, as known; return whether it was not."""
-        if key in self.known:
+    def note(self, keys: list[Key], oldest_ns: int) -> bool:
+        """Note events, that are used at once, as known; return whether none of them was."""
+        if not self.known.isdisjoint(keys):
             return False
-        self.known.add(key)
+        self.known.update(keys)
         if len(self.known) > self._most_known:
-            self._forget_known(oldest_ns)
+            # After twice as many as were kept: O(1) for each event.
+            self.known = {key for key in self.known if key[0] >= oldest_ns}
+            self._most_known = max(2 * len(self.known), MIN_KNOWN)
         return True
 
     @property
     def are_none(self) -> bool:
         """Whether no event is held back."""
-        return not (self._heap or self._blocks)
+        return not self._heap
 
-    def insert_velocities(self, velocities: VelocityBlock, oldest_ns: int) -> bool:
-        """Add velocities newer than all others; return False, and add none, if one is known."""
-        keys = list(zip(velocities.stamps_ns.tolist(), repeat(False), repeat(_LINEAR)))
-        if not self.known.isdisjoint(keys):
-            return False
-        self.known.update(keys)
-        self._blocks.append(velocities)
-        if len(self.known) > self._most_known:
-            self._forget_known(oldest_ns)
-        return True
-
-    def _forget_known(self, oldest_ns: int) -> None:
-        # After twice as many as were kept: O(1) for each event.
-        self.known = {key for key in self.known if key[0] >= oldest_ns}
-        self._most_known = max(2 * len(self.known), MIN_KNOWN)
-
-    def pop_until(self, stamp_ns: int) -> list[Ready]:
-        ready: list[Ready] = []
+    def pop_until(self, stamp_ns: int) -> list[Queued]:
+        ready: list[Queued] = []
         while self._heap and self._heap[0][0][0] <= stamp_ns:
-            key, event = heapq.heappop(self._heap)
-            ready += self._blocks_before(key)
+            _, event = heapq.heappop(self._heap)
+            if isinstance(event, VelocityBlock) and len(event) > 1:
+                event = self._cut(event, stamp_ns)
             ready.append(event)
-        return ready + self._blocks_before((stamp_ns, True, b''))
+        return ready
 
-    def pop_all(self) -> list[Ready]:
+    def _cut(self, velocities: VelocityBlock, stamp_ns: int) -> VelocityBlock:
+        """Return what comes until a stamp, and before what is next; the others are held back."""
+        end: Key = (stamp_ns, True, b'')
+        if self._heap:
+            end = min(end, self._heap[0][0])
+        has_those_at_end = (end[0], False, _LINEAR) < end
+        count = velocities.stamps_ns.searchsorted(end[0], 'right' if has_those_at_end else 'left')
+        if count < len(velocities):
+            rest = velocities.part(slice(count, None))
+            heapq.heappush(self._heap, ((rest.stamp_ns, False, _LINEAR), rest))
+        return velocities.part(slice(count))
+
+    def pop_all(self) -> list[Queued]:
         return self.pop_until(_NO_STAMP_NS)
-
-    def _blocks_before(self, key: Key) -> list[VelocityBlock]:
-        """Take out the velocities that come before a key, of blocks."""
-        side: Literal['left', 'right'] = 'right' if (*key[:1], False, _LINEAR) < key else 'left'
-        before = []
-        while self._blocks:
-            block = self._blocks[0]
-            count = int(block.stamps_ns.searchsorted(key[0], side))
-            if count == len(block):
-                before.append(self._blocks.popleft())
-                continue
-            if count:
-                before.append(block.part(slice(count)))
-                self._blocks[0] = block.part(slice(count, None))
-            break
-        return before
 
 
 class _Reception:
@@ -336,35 +299,46 @@ class _Reception:
         self._ahead_ns: deque[int] = deque(maxlen=RECENT)
         self._last_ns: int | None = None
 
-    def note(self, stamp_ns: int, receive_ns: int) -> None:
-        self._ahead_ns.append(stamp_ns - receive_ns)
-        self._last_ns = receive_ns
+    def note(self, event: Queued) -> None:
+        if event.receive_ns is None:
+            return
+        if isinstance(event, VelocityBlock):
+            self._ahead_ns.extend((event.stamps_ns - event.receive_ns).tolist())
+            self._last_ns = int(event.receive_ns[-1])
+        else:
+            self._ahead_ns.append(event.stamp_ns - event.receive_ns)
+            self._last_ns = event.receive_ns
 
-    def note_velocities(self, velocities: VelocityBlock) -> None:
-        if velocities.receive_ns is not None:
-            self._ahead_ns.extend((velocities.stamps_ns - velocities.receive_ns).tolist())
-            self._last_ns = int(velocities.receive_ns[-1])
-
-    def expected_ns(self, event: Event) -> int | None:
+    def expected_ns(self, event: Queued) -> int | None:
         """Return the newest stamp that can be received when this event was; None if unknown."""
-        if event.receive_ns is None or not self._ahead_ns:
+        received_ns = _received_ns(event)
+        if received_ns is None or not self._ahead_ns:
             return None
-        return event.receive_ns + max(self._ahead_ns)
+        return received_ns + max(self._ahead_ns)
 
-    def since_in_time_ns(self, event: Event) -> int | None:
+    def since_in_time_ns(self, event: Queued) -> int | None:
         """Return how long after the last one noted an event was received; None if unknown."""
-        if event.receive_ns is None or self._last_ns is None:
+        received_ns = _received_ns(event)
+        if received_ns is None or self._last_ns is None:
             return None
-        return event.receive_ns - self._last_ns
+        return received_ns - self._last_ns
 
 
-def _key(event: Event) -> Key:
-    if not isinstance(event, ObservationEvent):
-        is_angular = isinstance(event, AngularVelocityEvent)
-        return event.stamp_ns, False, _ANGULAR if is_angular else _LINEAR
+def _received_ns(event: Queued) -> int | None:
+    """Return when an event was received, of several the first."""
+    received_ns = event.receive_ns
+    return int(received_ns[0]) if isinstance(received_ns, np.ndarray) else received_ns
+
+
+def _keys(event: Queued) -> list[Key]:
+    """Return what no other event has; of several velocities what each has, in order."""
+    if isinstance(event, VelocityBlock):
+        return list(zip(event.stamps_ns.tolist(), repeat(False), repeat(_LINEAR)))
+    if isinstance(event, AngularVelocityEvent):
+        return [(event.stamp_ns, False, _ANGULAR)]
     # Keys outlive their events, which may be clouds of many points.
     content = event.ids.tobytes() + event.points.tobytes()
-    return event.stamp_ns, True, blake2b(content, digest_size=16).digest()
+    return [(event.stamp_ns, True, blake2b(content, digest_size=16).digest())]
 
 
 def _refusal(ahead_ns: int) -> InvalidEventError:

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 import logging
 
 from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 
 logger = logging.getLogger(__name__)
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
+import numpy as np
+
 from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_ns, to_s
-from slam_observer_ros.events import (
-    AngularVelocityEvent,
-    Event,
-    ObservationEvent,
-    VelocityBlock,
-    VelocityEvent,
-)
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityBlock
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
@@ -66,9 +62,21 @@ class Timeline:
         self._in_force_ns = 0  # no velocity of before can change what is in force
         self._newest_ns: dict[type, int] = {}
 
-    def is_late(self, event: Event) -> bool:
+    def is_late(self, measured: VelocityBlock | AngularVelocityEvent) -> bool:
         """Return whether what was in force at its stamp can't be changed any more."""
-        return event.stamp_ns < self._in_force_ns
+        return measured.stamp_ns < self._in_force_ns
+
+    def parts(self, velocities: VelocityBlock) -> Iterator[VelocityBlock]:
+        """Yield velocities as :meth:`append` takes them, each time those that are next."""
+        if len(velocities) > 1 and velocities.stamp_ns <= max(
+            self.stamp_ns or -1, self._in_force_ns - 1
+        ):
+            yield from velocities.one_by_one()
+            return
+        while len(velocities) > (room := MAX_PENDING_VELOCITIES - self._pending):
+            yield velocities.part(slice(room))
+            velocities = velocities.part(slice(room, None))
+        yield velocities
 
     def _note_stamp(self, stamp_ns: int) -> int:
         """Note the stamp of an event that is about to be used; return ``state_ns``."""
@@ -78,49 +86,31 @@ class Timeline:
             self.state_ns = stamp_ns
         return self.state_ns
 
-    def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
-        """Add a velocity; return whether it is in force: an angular one waits for a linear one.
+    def append(self, measured: VelocityBlock | AngularVelocityEvent) -> bool:
+        """Add velocities; return whether they are in force: an angular one waits for a linear one.
 
-        A late one leads on from where velocities can still be changed. After many of them the
-        hypotheses are moved on without an observation. Raise :exc:`InvalidEventError` if a newer
-        velocity of its kind was used before it (``'too_late'``).
+        A late one, which is alone, leads on from where velocities can still be changed. Raise
+        :exc:`InvalidEventError` if a newer one of its kind was used before it (``'too_late'``).
         """
         # Each kind in stamp order, and none before what is already in force.
-        kind, stamp_ns = type(event), event.stamp_ns
-        if stamp_ns < self._newest_ns.get(kind, 0):
+        kind, first_ns, count = type(measured), measured.stamp_ns, 1
+        last_ns = first_ns
+        if isinstance(measured, VelocityBlock):
+            last_ns, count = int(measured.stamps_ns[-1]), len(measured)
+        if first_ns < self._newest_ns.get(kind, 0):
             raise InvalidEventError('too_late', 'a newer velocity was already used')
-        self._newest_ns[kind] = stamp_ns
-        if stamp_ns < self._in_force_ns:
-            stamp_ns = self._in_force_ns
-            event = replace(event, stamp_ns=stamp_ns)
-        if not self.velocities.append(event):
+        self._newest_ns[kind] = last_ns
+        if first_ns < self._in_force_ns:
+            first_ns = last_ns = self._in_force_ns
+            measured = _at(measured, first_ns)
+        if not self.velocities.append(measured):
             return False
         # In force from now on; the state follows at the next observation, or after many.
-        self._in_force_ns = stamp_ns
-        self._note_stamp(stamp_ns)
-        self._pending += 1
-        if self._pending >= MAX_PENDING_VELOCITIES:
-            self.advance_after_many()
-        return True
-
-    def takes(self, velocities: VelocityBlock) -> bool:
-        """Return whether the velocities are newer than all that was used, of one sensor alone."""
-        newest_ns = max(self.stamp_ns or -1, self._in_force_ns - 1)
-        return bool(velocities.stamps_ns[0] > newest_ns) and self.velocities.is_of_one_sensor
-
-    @property
-    def room(self) -> int:
-        """How many velocities can be added before the hypotheses are moved on."""
-        return MAX_PENDING_VELOCITIES - self._pending
-
-    def append_velocities(self, velocities: VelocityBlock) -> None:
-        """Add velocities that it :meth:`takes`, no more than there is :attr:`room` for."""
-        first_ns, last_ns = velocities.stamps_ns[[0, -1]].tolist()
-        self.velocities.append_velocities(velocities)
+        self._in_force_ns = last_ns
         self._note_stamp(first_ns)
         self._note_stamp(last_ns)
-        self._newest_ns[VelocityEvent] = self._in_force_ns = last_ns
-        self._pending += len(velocities)
+        self._pending += count
+        return True
 
     def advance_after_many(self) -> None:
         """Move the hypotheses on without an observation if many velocities wait for one."""
@@ -199,3 +189,12 @@ class Timeline:
             return se3.inverse(self.motion(end_ns, start_ns))
         calibration = self._hypotheses.best.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
+
+
+def _at(
+    measured: VelocityBlock | AngularVelocityEvent, stamp_ns: int
+) -> VelocityBlock | AngularVelocityEvent:
+    """Return a single velocity with another stamp."""
+    if isinstance(measured, VelocityBlock):
+        return replace(measured, stamps_ns=np.array([stamp_ns]))
+    return replace(measured, stamp_ns=stamp_ns)

@@ -1,6 +1,7 @@
 """Consistency: whether the covariances (..., d, d) that are stated match the errors (..., d) made.
 
 NEES: normalised estimation error squared, εᵀ Σ⁻¹ ε; ANEES: its mean, per degree of freedom.
+Ellipses of 95 % show such covariances in a plane of the map.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.geometry import se3, so3
@@ -183,3 +184,37 @@ def _rigid_motions(centred: FloatArray, k: int) -> FloatArray:
     motions = np.concatenate([shifts, turns], axis=2).reshape(len(centred) * k, -1)
     U, sizes, _ = np.linalg.svd(motions, full_matrices=False)
     return np.asarray(U[:, sizes > _ROUNDING * sizes[0]])
+
+
+CHI_SQUARE_95 = 5.991464547107979
+"""Squared half-axis, in standard deviations, of the ellipse that holds 95 % in a plane."""
+
+_CORNERS = 37
+
+
+def ellipses(covariances: FloatArray, axes: tuple[int, int]) -> FloatArray:
+    """Return half-axes, metres, and the angle of the first one, rad: (n, 3) for 95 %.
+
+    ``covariances`` (n, 3, 3), m², are projected on two of the world's axes.
+    """
+    in_plane = covariances[:, axes][:, :, axes]
+    variances, directions = np.linalg.eigh(in_plane)
+    half = np.sqrt(CHI_SQUARE_95 * np.maximum(variances[:, ::-1], 0.0))
+    first = directions[:, :, 1]
+    return np.column_stack([half, np.arctan2(first[:, 1], first[:, 0])])
+
+
+def outlines(points: FloatArray, covariances: FloatArray, axes: tuple[int, int]) -> FloatArray:
+    """Return the ellipses round points (n, 3) as one line (n · 38, 2), with a break after each."""
+    half_a, half_b, angles = ellipses(covariances, axes).T[:, :, None]
+    turn = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+    a, b = half_a * np.cos(turn), half_b * np.sin(turn)
+    offsets = np.stack(
+        [
+            a * np.cos(angles) - b * np.sin(angles),
+            a * np.sin(angles) + b * np.cos(angles),
+        ],
+        axis=2,
+    )
+    closed = points[:, None, axes] + offsets
+    return np.concatenate([closed, np.full((len(points), 1, 2), np.nan)], axis=1).reshape(-1, 2)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import MAX_GAP_NS, Trajectory
 from slam_observer_ros.geometry import se3, so3

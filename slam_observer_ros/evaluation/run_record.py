@@ -1,4 +1,4 @@
-"""What is recorded of a run, to be shown: states at instants, and residuals."""
+"""What is recorded of a run, to be shown and to be compared with: the estimate, and the truth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,22 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate
+
+
+@dataclass(frozen=True, slots=True)
+class PoseTruth:
+    """True pose (4, 4) of the robot, base frame to world, at a time."""
+
+    stamp_ns: int
+    pose: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkTruth:
+    """True positions (n, 3) of landmarks, in the world, metres, and their ids (n,)."""
+
+    ids: IntArray
+    world_points: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

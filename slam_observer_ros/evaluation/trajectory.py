@@ -12,8 +12,8 @@ import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.files import read_lines, unfinished_file
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.geometry import se3, so3
 
 MAX_GAP_NS = NANOSECONDS_PER_SECOND // 2

@@ -9,10 +9,11 @@ import logging
 from typing import TypeAlias
 
 from slam_observer_ros.common.errors import InvalidEventError, TransformError
-from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.inputs.pose_differences import PoseDifferences
+from slam_observer_ros.inputs.odometry import PoseDifferences
 from slam_observer_ros.messages.poses import PoseMessage
 
 MAX_WAITING = 1000
@@ -177,11 +178,7 @@ class EventBuilder:
             self._on_drop(error)
             return []
         self._taken_as_base[measured.sensor_frame] = deadline_ns, measured
-        logger.warning(
-            "Velocities in frame '%s' are taken to be those of '%s' until their transform is "
-            'known: %s',
-            measured.sensor_frame,
-            self._base_frame.name,
-            error,
-        )
+        frame, base_frame = measured.sensor_frame, self._base_frame.name
+        finding = found('velocity_frame', frame=frame, base_frame=base_frame, error=error)
+        logger.warning('%s', finding)
         return [measured]

@@ -14,10 +14,10 @@ import logging
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.geometry import se3
 
 logger = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class TransformBuffer:
         """Log, once for each frame, why a transform is not used."""
         if child not in self._refused:
             self._refused.add(child)
-            logger.warning("A transform on /tf of frame '%s' is not used: %s.", child, reason)
+            logger.warning('%s', found('unused_transform', frame=child, reason=reason))
 
     def clear(self) -> None:
         """Forget what has a time, as after a jump of the clock; static transforms stay."""

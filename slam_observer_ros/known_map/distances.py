@@ -27,7 +27,7 @@ for _first, _second in permutations(range(3), 2):
 
 
 class MappedLandmarks:
-    """n landmarks of a map, with the distances between those that can be in view together."""
+    """n landmarks of a map, and the distances between any that can be in view together."""
 
     def __init__(self, points: FloatArray, covariances: FloatArray, axes: EstimatedAxes) -> None:
         from scipy.spatial import cKDTree  # which only points without ids need

@@ -9,14 +9,14 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.known_map.finder import Finder
+from slam_observer_ros.known_map.finder import Finder, Unexplained
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_alignment import pose_by_tag, TagPose
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
 from slam_observer_ros.known_map.places import Place
-from slam_observer_ros.known_map.tag_pose import pose_by_tag, TagPose
-from slam_observer_ros.known_map.unexplained import Unexplained
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Outcome
 
@@ -62,10 +62,7 @@ class Localiser:
         """Take maps instead of those loaded before; the pose in one of them is yet to be found."""
         self.maps = [known.flattened() if two_d_mode else known for known in maps]
         if any(known.is_planar for known in maps) and not two_d_mode:
-            logger.warning(
-                'The map was made with two_d_mode, which is off: in space its heights of zero are '
-                'taken for exact (use two_d_mode: true for a robot on a floor).'
-            )
+            logger.warning('%s', found('flat_map'))
         self._refused = set()
         self._search_again()
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map.constellation import find_places
 from slam_observer_ros.known_map.distances import MappedLandmarks
 from slam_observer_ros.known_map.landmark_map import LandmarkMap

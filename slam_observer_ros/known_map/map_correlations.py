@@ -70,8 +70,8 @@ def parse(
 ) -> FloatArray:
     """Return the joint covariance of ``landmarks`` as they were read.
 
-    Raise :exc:`MapError` if it can't be right, or is not that of these landmarks, each of which
-    has one of the ``covariances`` (n, 3, 3), m².
+    Raise :exc:`MapError` if it can't be right, or is not that of these landmarks, whose
+    own ``covariances`` (n, 3, 3), m², are known.
     """
     try:
         return _parsed(content, landmarks, covariances)

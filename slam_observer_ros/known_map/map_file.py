@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from slam_observer_ros import __version__
 from slam_observer_ros.common.errors import MapError, shown, YamlError
 from slam_observer_ros.common.files import destination, keep_copy, unfinished_file
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.common.yaml_files import (
     constructed,
     FAST_LOADER,
@@ -89,7 +89,7 @@ def write_map(
         'format': FORMAT,
         'version': FORMAT_VERSION,
         'frame': landmark_map.frame_id,
-        'package_version': VERSION,
+        'package_version': __version__,
     }
     if settings is not None:
         head['settings'] = {

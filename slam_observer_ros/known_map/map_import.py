@@ -24,16 +24,17 @@ from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_rows import (
+from slam_observer_ros.known_map.map_tables import (
     facing,
     finite,
     naming,
+    QUATERNION,
     reason,
     Row,
+    table_rows,
     turned,
     UNKNOWN_NOISE,
 )
-from slam_observer_ros.known_map.map_tables import QUATERNION, table_rows
 
 MAX_BYTES = 20_000_000
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 """One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""

@@ -16,7 +16,7 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import CdrReader
-from slam_observer_ros.messages.cloud_fields import skip_cloud
+from slam_observer_ros.messages.clouds import skip_cloud
 from slam_observer_ros.messages.fiducials import NESTED, observed_poses, orientations_of
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.messages.registry import Decoder, reads
@@ -120,9 +120,9 @@ def observed_tags(
 ) -> list[ObservationEvent]:
     """Return what of /tf are sightings of fiducials: transforms from a camera to a tag.
 
-    A tag's frame is the prefix and its id, or, as apriltag_ros has it, ``family:id``. Those that
-    are no transforms, which have NaN in them for example, are left out, and so are numbers beyond
-    ``MAX_ID``. One measurement is returned for each camera and stamp.
+    A tag's frame is the prefix and its id, or, as apriltag_ros has it, ``family:id``. What is
+    no transform, and has NaN in it for example, is left out, and so are numbers beyond ``MAX_ID``.
+    One measurement is returned for each camera and stamp.
     """
     # Other things have names with a colon, too, and longer numbers than a family has tags.
     pattern = re.compile(rf'{re.escape(tag_frame_prefix)}(\d+)|\w+:(\d{{1,9}})')

@@ -138,5 +138,5 @@ def _read_isaac_apriltag(reader: CdrReader) -> tuple[int, FloatArray]:
 
 
 def _usable(ids: IntArray) -> IntArray:
-    """Return the unknown id in place of those that could not be published."""
+    """Return the unknown id in place of any that could not be published."""
     return np.where((ids >= 0) & (ids <= MAX_ID), ids, UNKNOWN_ID)

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.events import MAX_ID, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import encode_string
-from slam_observer_ros.messages.cloud_fields import (
+from slam_observer_ros.messages.clouds import (
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,
     ID_NAME,

@@ -79,7 +79,7 @@ def reads(
 
 
 def decoders(role: Role) -> dict[str, Decoder[Any]]:
-    """Return what decodes the types of which something is read, by their names."""
+    """Return what decodes the types that are read, by their names."""
     types = message_types(role).values()
     return {known.name: cast('Decoder[Any]', known.decode) for known in types}
 

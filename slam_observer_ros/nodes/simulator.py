@@ -10,8 +10,8 @@ from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
 
-from slam_observer_ros.common.units import to_ns
-from slam_observer_ros.evaluation.truth import PoseTruth
+from slam_observer_ros.common.stamps import to_ns
+from slam_observer_ros.evaluation.run_record import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.logs import ThrottledLog

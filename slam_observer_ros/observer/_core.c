@@ -8,18 +8,11 @@
  * All that could be read or written beyond an array's end is checked when the arrays come in, in
  * the functions named read_...; nothing is checked after them. Nothing is kept from call to call.
  */
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
-
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
-
-typedef int64_t i64;
+#include "_door.h" /* first, as it includes Python.h */
+#include "_linear.h"
 
 enum { UNUSUAL = -1, AT_REST = 0, DONE = 1 };
 
-static const double ZERO_GUARD = 1e-300;     /* so3.py: 0/0 becomes 0 / 1e-300 */
 static const double TINY = 2.2250738585072014e-308;
 static const double SPEED_WINDOW_S = 1.0;    /* motion_noise.py */
 static const double MEMORY = 300.0;
@@ -37,174 +30,7 @@ static const int REWEIGHTINGS = 2;
 static const i64 LATEST_NS = (i64)1 << 61;   /* stamps beyond it are unusual: no sum overflows */
 static const long MAX_ROOM = 1 << 15;        /* rows of P: no product of sizes overflows */
 
-static double larger(double a, double b) { return a > b ? a : b; }
-static double smaller(double a, double b) { return a < b ? a : b; }
 static double seconds(i64 later_ns, i64 since_ns) { return (double)(later_ns - since_ns) / 1e9; }
-
-/* ------------------------------------------------------------------ vectors and 3 x 3 matrices */
-
-static double dot3(const double *a, const double *b) {
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-
-static void hat(const double w[3], double K[9]) { /* (7)  K v = w x v */
-    K[0] = K[4] = K[8] = 0.0;
-    K[1] = -w[2], K[2] = w[1];
-    K[3] = w[2], K[5] = -w[0];
-    K[6] = -w[1], K[7] = w[0];
-}
-
-static void times(const double A[9], const double B[9], double C[9]) {
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++)
-            C[3 * i + j] = A[3 * i] * B[j] + A[3 * i + 1] * B[3 + j] + A[3 * i + 2] * B[6 + j];
-}
-
-static void times_transposed(const double A[9], const double B[9], double C[9]) { /* A B' */
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++)
-            C[3 * i + j] = dot3(A + 3 * i, B + 3 * j);
-}
-
-static void turn(const double R[9], const double v[3], double out[3]) { /* R v */
-    for (int i = 0; i < 3; i++)
-        out[i] = dot3(R + 3 * i, v);
-}
-
-static void turn_back(const double R[9], const double v[3], double out[3]) { /* R' v */
-    for (int i = 0; i < 3; i++)
-        out[i] = R[i] * v[0] + R[3 + i] * v[1] + R[6 + i] * v[2];
-}
-
-static void turned_covariance(const double R[9], const double C[9], double out[9]) { /* R C R' */
-    double half[9];
-    times(R, C, half);
-    times_transposed(half, R, out);
-}
-
-/* exp(w) (Rodrigues) and the left Jacobian J, both polynomials in K = hat(w): so3.py */
-static void exp_and_jacobian(const double w[3], double R[9], double J[9]) {
-    double square = dot3(w, w) + ZERO_GUARD, half_angle = 0.5 * sqrt(square);
-    double ratio = sin(half_angle) / half_angle;
-    double a = ratio * cos(half_angle), b = 0.5 * ratio * ratio, c = (1.0 - a) / square;
-    double K[9], K2[9];
-    hat(w, K);
-    times(K, K, K2);
-    for (int i = 0; i < 9; i++) {
-        double identity = i % 4 == 0 ? 1.0 : 0.0;
-        R[i] = identity + a * K[i] + b * K2[i];
-        J[i] = identity + b * K[i] + c * K2[i];
-    }
-}
-
-static void normalise(double R[9]) { /* R (3 I - R' R) / 2 */
-    double G[9], whole[9];
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++)
-            G[3 * i + j] = (i == j ? 3.0 : 0.0)
-                           - (R[i] * R[j] + R[3 + i] * R[3 + j] + R[6 + i] * R[6 + j]);
-    times(R, G, whole);
-    for (int i = 0; i < 9; i++)
-        R[i] = 0.5 * whole[i];
-}
-
-typedef struct {
-    double R[9], x[3];
-} Pose;
-
-static Pose pose_of(const double A[16]) {
-    Pose pose;
-    for (int i = 0; i < 3; i++) {
-        memcpy(pose.R + 3 * i, A + 4 * i, 3 * sizeof(double));
-        pose.x[i] = A[4 * i + 3];
-    }
-    return pose;
-}
-
-static void write_pose(const Pose *pose, double A[16]) {
-    for (int i = 0; i < 3; i++) {
-        memcpy(A + 4 * i, pose->R + 3 * i, 3 * sizeof(double));
-        A[4 * i + 3] = pose->x[i];
-    }
-    A[12] = A[13] = A[14] = 0.0;
-    A[15] = 1.0;
-}
-
-/* ---------------------------------------------- Cholesky factors L of n x n matrices, in place */
-
-static int factor(double *S, long n) { /* returns 0 where S is not positive definite */
-    for (long j = 0; j < n; j++) {
-        double *row = S + j * n, square = row[j];
-        for (long l = 0; l < j; l++)
-            square -= row[l] * row[l];
-        if (!(square > 0.0))
-            return 0;
-        row[j] = sqrt(square);
-        for (long i = j + 1; i < n; i++) {
-            double *below = S + i * n, sum = below[j];
-            for (long l = 0; l < j; l++)
-                sum -= below[l] * row[l];
-            below[j] = sum / row[j];
-        }
-    }
-    return 1;
-}
-
-static void solve_lower(const double *L, long n, double *b) { /* L^-1 b */
-    for (long i = 0; i < n; i++) {
-        for (long l = 0; l < i; l++)
-            b[i] -= L[i * n + l] * b[l];
-        b[i] /= L[i * n + i];
-    }
-}
-
-static void solve_upper(const double *L, long n, double *b) { /* L'^-1 b */
-    for (long i = n - 1; i >= 0; i--) {
-        b[i] /= L[i * n + i];
-        for (long l = 0; l < i; l++)
-            b[l] -= L[i * n + l] * b[i];
-    }
-}
-
-/* L^-1 B, of which each row has ``width`` entries */
-static void solve_lower_rows(const double *L, long n, double *B, long width, long stride) {
-    for (long i = 0; i < n; i++) {
-        double *row = B + i * stride, inverse = 1.0 / L[i * n + i];
-        for (long l = 0; l < i; l++) {
-            const double *above = B + l * stride, share = L[i * n + l];
-            for (long j = 0; j < width; j++)
-                row[j] -= share * above[j];
-        }
-        for (long j = 0; j < width; j++)
-            row[j] *= inverse;
-    }
-}
-
-/* The squared Mahalanobis distance of r (k) in a covariance (k x k); -1 if that is indefinite. */
-static double squared_distance(const double *r, const double *covariance, int k) {
-    double L[9], z[3];
-    memcpy(L, covariance, (size_t)(k * k) * sizeof(double));
-    memcpy(z, r, (size_t)k * sizeof(double));
-    if (!factor(L, k))
-        return -1.0;
-    solve_lower(L, k, z);
-    double square = 0.0;
-    for (int b = 0; b < k; b++)
-        square += z[b] * z[b];
-    return square;
-}
-
-static void copy_block(const double *S, long n, long i, int k, double *block) {
-    for (int b = 0; b < k; b++)
-        memcpy(block + b * k, S + (i * k + b) * n + i * k, (size_t)k * sizeof(double));
-}
-
-static double sum_of_squares(const double *z, long n) {
-    double sum = 0.0;
-    for (long i = 0; i < n; i++)
-        sum += z[i] * z[i];
-    return sum;
-}
 
 /* -------------------------------------------- P, of which both triangles are kept: P += s U' V */
 
@@ -275,101 +101,9 @@ static void mirror(double *P, long room, long N) { /* the upper triangle to the 
                     P[col * room + row] = P[row * room + col];
 }
 
-/* ---------------------------------------------- the door: tuples of arrays from flat_arrays.py */
-
-enum { MAX_ARRAYS = 48, SIZES = 128, UNBOUND = -1 };
-
-/* Views of all arrays of a call, and the sizes that letters stand for in their shapes: what the
- * first array with a letter has there, or what it was set to. */
-typedef struct {
-    Py_buffer views[MAX_ARRAYS];
-    int count;
-    Py_ssize_t sizes[SIZES];
-} Door;
-
-typedef char members_have_8_bytes[sizeof(void *) == 8 && sizeof(double) == 8 ? 1 : -1];
-
-static void open_door(Door *door) {
-    door->count = 0;
-    for (int letter = 0; letter < SIZES; letter++)
-        door->sizes[letter] = letter >= '0' && letter <= '9' ? letter - '0' : UNBOUND;
-    door->sizes['T'] = 13;
-}
-
-static void close_door(Door *door) {
-    while (door->count)
-        PyBuffer_Release(&door->views[--door->count]);
-}
-
-static int refuse(const char *what) {
-    PyErr_Format(PyExc_ValueError, "%s: a part has not the type or shape that belongs here", what);
-    return 0;
-}
-
-/* The address of an array as ``spec`` describes it, a kind and its shape; NULL with an error. */
-static void *read_array(Door *door, PyObject *array, const char *spec, const char *what) {
-    static double nothing; /* of an array without entries there may be no address */
-    char kind = spec[0] == 'D' ? 'd' : spec[0] == 'L' ? 'l' : spec[0];
-    int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (kind == spec[0] ? 0 : PyBUF_WRITABLE);
-    Py_buffer *view = &door->views[door->count];
-    if (door->count == MAX_ARRAYS || PyObject_GetBuffer(array, view, flags)) {
-        if (!PyErr_Occurred())
-            refuse(what);
-        return NULL;
-    }
-    door->count++;
-    const char *format = view->format == NULL ? "B" : view->format;
-    int is_fit = (format[0] == kind || (kind == 'l' && format[0] == 'q')) && format[1] == '\0'
-                 && view->itemsize == (kind == '?' ? 1 : 8) && view->ndim == (int)strlen(spec + 1);
-    for (int d = 0; is_fit && d < view->ndim; d++) {
-        Py_ssize_t *size = &door->sizes[(int)spec[1 + d]];
-        *size = *size == UNBOUND ? view->shape[d] : *size;
-        is_fit = view->shape[d] == *size;
-    }
-    if (!is_fit)
-        refuse(what);
-    return !is_fit ? NULL : view->buf == NULL ? &nothing : view->buf;
-}
-
-/* Read a tuple into a struct whose first members are its fields, 8 bytes each: by their specs, an
- * int64 i, a number f, a truth b, or an array of float64 d, int64 l or bool ?, in capitals where
- * it is written to; after ~ it may be None, and is NULL then. */
-static int read_fields(Door *door, PyObject *tuple, const char *const specs[], void *fields,
-                       const char *what) {
-    Py_ssize_t count = 0;
-    while (specs[count])
-        count++;
-    if (!PyTuple_Check(tuple) || PyTuple_GET_SIZE(tuple) != count)
-        return refuse(what);
-    for (Py_ssize_t i = 0; i < count; i++) {
-        PyObject *item = PyTuple_GET_ITEM(tuple, i);
-        const char *spec = specs[i] + (specs[i][0] == '~');
-        char *member = (char *)fields + 8 * i;
-        if (spec[0] == 'f') {
-            double number = PyFloat_AsDouble(item);
-            memcpy(member, &number, 8);
-        } else if (spec[0] == 'i' || spec[0] == 'b') {
-            i64 integer = spec[0] == 'i' ? PyLong_AsLongLong(item) : PyObject_IsTrue(item);
-            memcpy(member, &integer, 8);
-        } else {
-            int is_none = spec != specs[i] && item == Py_None;
-            void *address = is_none ? NULL : read_array(door, item, spec, what);
-            memcpy(member, &address, 8);
-        }
-        if (PyErr_Occurred())
-            return 0;
-    }
-    return 1;
-}
+/* ------------------------------------- the door: structs of the tuples from flat_arrays.py */
 
 static int is_stamp(i64 stamp_ns) { return -LATEST_NS < stamp_ns && stamp_ns < LATEST_NS; }
-
-static int are_within(const i64 *numbers, Py_ssize_t count, i64 most) {
-    for (Py_ssize_t j = 0; j < count; j++)
-        if (numbers[j] < 0 || numbers[j] > most)
-            return 0;
-    return 1;
-}
 
 /* The structs begin with the fields of the tuples of that name, in their order. */
 
@@ -396,10 +130,12 @@ static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
     x->n = (long)door->sizes['n'], x->room = (long)door->sizes['R'];
     x->c = (long)door->sizes['c'], x->c_v = (long)door->sizes['v'];
     door->sizes['p'] = x->p;
-    return (x->room <= MAX_ROOM && x->n <= MAX_ROOM && x->c <= MAX_ROOM && x->c_v <= x->c
-            && x->first == x->p + x->c && x->N == x->first + x->k * x->n && x->N <= x->room
-            && are_within(x->estimated, x->c_v, 12))
-           || refuse("Estimate");
+    if (x->room > MAX_ROOM || x->n > MAX_ROOM || x->c > MAX_ROOM || x->c_v > x->c
+        || x->first < x->p + x->c || x->first > x->room || x->N != x->first + x->k * x->n
+        || x->N > x->room || !are_within(x->estimated, x->c_v, 12))
+        return refuse("Estimate");
+    door->sizes['f'] = (Py_ssize_t)x->first - x->p;
+    return 1;
 }
 
 typedef struct {
@@ -491,7 +227,7 @@ typedef struct {
 
 static int read_observed(Door *door, PyObject *tuple, Observed *out) {
     static const char *const specs[] = {"D44", "Lm",   "Dm3", "Dm3", "Dm", "Dm3",
-                                        "Dm3", "Do33", "Dm",  "Dc",  "Dj", NULL};
+                                        "Dm3", "Do33", "Dm",  "Df",  "Dj", NULL};
     if (!read_fields(door, tuple, specs, out, "Observed"))
         return 0;
     Py_ssize_t judged = door->sizes['j'];
@@ -877,9 +613,10 @@ typedef struct {
 
 /* Lay the arrays of residuals out in one piece of memory, or count how many numbers they take. */
 static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory) {
-    size_t k = (size_t)x->k, n = (size_t)m, M = n * k, c = (size_t)x->c, q = (size_t)x->first;
+    size_t k = (size_t)x->k, n = (size_t)m, M = n * k, c = (size_t)x->c;
+    size_t q = (size_t)x->p + c;
     size_t used = 0;
-    res->m = m, res->M = (long)M, res->q = x->first, res->k = x->k;
+    res->m = m, res->M = (long)M, res->q = (long)q, res->k = x->k;
 #define TAKE(field, count) (res->field = memory ? memory + used : NULL, used += (count))
     TAKE(points, 3 * n), TAKE(stated, 9 * n), TAKE(r, M), TAKE(R, M * k), TAKE(D, M * c);
     TAKE(repeated, n), TAKE(predicted, M * M), TAKE(S, M * M), TAKE(L, M * M), TAKE(z, M);
@@ -1376,7 +1113,7 @@ static void move(const Estimate *x, const double *dx, const Observed *out) {
         for (int b = 0; b < 3; b++)
             a[b] = turned_a[b] + (moved[b] + (turned[b] - y_ref[b]));
     }
-    memcpy(out->shift, dx + x->p, (size_t)x->c * sizeof(double));
+    memcpy(out->shift, dx + x->p, (size_t)(x->first - x->p) * sizeof(double));
 }
 
 /* How far off each residual was, its density given those before it, shares; then all together. */
@@ -1426,7 +1163,7 @@ static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
 static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Factors *factors,
                    const Observed *out) {
-    if (seen->m < 1 || seen->m > MAX_SEEN || x->first > 64 || !is_stamp(seen->stamp_ns))
+    if (seen->m < 1 || seen->m > MAX_SEEN || x->c > 64 || !is_stamp(seen->stamp_ns))
         return UNUSUAL;
     Residuals res;
     size_t numbers = lay_out(&res, x, seen->m, NULL), M = (size_t)res.M;

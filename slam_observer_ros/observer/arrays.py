@@ -6,8 +6,7 @@ from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
-from slam_observer_ros.common.columns import LandmarkColumns
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, LandmarkColumns
 from slam_observer_ros.observer.orientations import LandmarkOrientations
 from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration

@@ -36,17 +36,24 @@ class Step(NamedTuple):
 
 
 class Chart:
-    """Columns of P: ``first`` = p + c of pose and calibration, then ``stride`` of each landmark.
+    """Columns of P: ``robot`` = p + c of ε and c̃, then from ``first`` on ``stride`` a landmark.
 
     ``turn`` = q of these are of ω_i where orientations are estimated, ``velocity`` = k of ũ_i
-    where velocities are; else 0.
+    where velocities are; else 0. Before ``first`` there may be ``postponed`` ones, of what no
+    motion and no view acts on: see :mod:`.compressed_covariance`.
     """
 
     def __init__(
-        self, axes: EstimatedAxes, calibrated: int, turn: int = 0, velocity: int = 0
+        self,
+        axes: EstimatedAxes,
+        calibrated: int,
+        turn: int = 0,
+        velocity: int = 0,
+        postponed: int = 0,
     ) -> None:
         self.axes, self.turn, self.velocity = axes, turn, velocity
-        self.first = axes.p + calibrated
+        self.robot = axes.p + calibrated
+        self.first = self.robot + postponed
         self.stride = axes.point + turn + velocity
         self._points = self.first + np.arange(axes.point)
         self._turns = self.first + axes.point + np.arange(turn)
@@ -55,8 +62,13 @@ class Chart:
 
     def with_calibration(self, count: int) -> Chart:
         """Return the chart with so many more entries in c̃."""
-        calibrated = self.first - self.axes.p + count
+        calibrated = self.robot - self.axes.p + count
         return Chart(self.axes, calibrated, self.turn, self.velocity)
+
+    def with_postponed(self, count: int) -> Chart:
+        """Return the chart with so many postponed columns."""
+        calibrated = self.robot - self.axes.p
+        return Chart(self.axes, calibrated, self.turn, self.velocity, count)
 
     # Where in x
 
@@ -162,7 +174,7 @@ class Chart:
         xi, omega, u = np.split(parts, [k, k + self.turn], axis=1)
         return Step(
             slam_group.exp(axes.full_pose(x[:p]), axes.full_points(xi)),
-            x[p : self.first],
+            x[p : self.robot],
             axes.full_turns(omega) if self.turn else None,
             axes.full_points(u) if self.velocity else None,
         )

@@ -34,8 +34,7 @@ class Errors:
         """
         if motion is None:
             return self.axes.full_pose_covariance(self.joint.pose)
-        P = self.joint.P[: self.joint.first, : self.joint.first]
-        return self.axes.full_pose_covariance(motion.pose_covariance(P))
+        return self.axes.full_pose_covariance(motion.pose_covariance(self.joint.of_robot))
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
         """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""

@@ -18,7 +18,7 @@ class Estimate(NamedTuple):
     a: FloatArray  # (n, 3) â_i, changed in place
     P: FloatArray  # (room, room) of which the first N rows and columns count, changed in place
     size: int  # N
-    first: int  # p + c, the first column of the landmarks
+    first: int  # the first column of the landmarks; what is postponed is between p + c and it
     is_planar: bool  # whether p is 3 and k is 2, in place of 6 and 3
     calibration: FloatArray  # (13,) 1 + s, b, and τ of velocities
     estimated: IntArray  # (c_v,) which of these c̃ begins with; scales, biases, delay
@@ -95,7 +95,8 @@ class Observed(NamedTuple):
     # (m, 3, 3) of the points, body frame, m²; (0, 3, 3) where none were stated
     covariances: FloatArray
     dt_s: FloatArray  # (m,) since each was seen before; infinite if it was not
-    shift: FloatArray  # (c,) by how much the calibration is to be moved
+    # (first − p,) by how much the calibration is to be moved, and what is postponed
+    shift: FloatArray
     # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
     # normalised innovation squared of all; empty where nobody asks
     judged: FloatArray

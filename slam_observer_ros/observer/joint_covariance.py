@@ -53,6 +53,7 @@ class JointCovariance:
 
     def _use(self, chart: Chart) -> None:
         self.chart, self.first, self._stride = chart, chart.first, chart.stride
+        self._robot = slice(chart.robot)
 
     @property
     def P(self) -> FloatArray:  # noqa: N802 (the field's name for it)
@@ -75,9 +76,14 @@ class JointCovariance:
         return self.P[: self._p, : self._p]
 
     @property
+    def of_robot(self) -> FloatArray:
+        """(p + c, p + c) covariance of ε and c̃."""
+        return self.P[self._robot, self._robot]
+
+    @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of the calibration."""
-        variances: FloatArray = np.diagonal(self.P)[self._p : self.first]
+        variances: FloatArray = np.diagonal(self.of_robot)[self._p :]
         return variances
 
     def add_calibration(self, variances: FloatArray) -> None:
@@ -150,12 +156,12 @@ class JointCovariance:
 
     def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
         """Let x become x + J (F c̃ + w), w the noise of a motion, with J's rows of landmarks."""
-        P, p, c = self.P, self._p, slice(self._p, self.first)
+        P, p, c = self.P, self._p, slice(self._p, self.chart.robot)
         JT = np.zeros((p, len(P)))  # how a motion of the robot alone changes x, transposed
         JT[:, :p] = np.eye(p)
         JT[:, self.first :] = J_landmarks.T
         # P + J (F P_c + F P_c,c Fᵀ Jᵀ / 2 + noise Jᵀ / 2) + its transpose.
-        if p == self.first:
+        if p == c.stop:
             self._matrix.add_symmetric_product(JT, (0.5 * motion.noise).dot(JT))
             return
         F = motion.sensitivity

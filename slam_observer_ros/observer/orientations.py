@@ -7,8 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from slam_observer_ros.common.columns import LandmarkColumns
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, LandmarkColumns
 
 UNKNOWN_RAD = 100.0
 """Standard deviation about each axis of an orientation of which nothing is known."""

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf, dpotrs
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, with_blocks
@@ -94,7 +94,7 @@ def advance(
     _summed_noise(Ad, se3.at_poses(Q), out)
     F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
     # x ← x + J (F c̃ + w), and ξ_i ← ξ_i + [ŷ_i]× ε_Ω of what is added to ε
-    P, of_c = x.P, slice(p, x.first)
+    P, of_c = x.P, slice(p, p + c)
     JT = np.zeros((p, len(P)))
     JT[:, :p] = np.eye(p)
     JT[:, x.first : x.size] = -axes.turn_matrix(x.y_ref + x.a).reshape(-1, p).T
@@ -310,7 +310,7 @@ def _residuals(
     # How r_i changes with the sensor that saw the point.
     D = None
     if seen.sensor is not None and len(seen.of_sensor):
-        D = np.zeros((len(r), k, x.first - axes.p))
+        D = np.zeros((len(r), k, len(x.drift)))
         of_sensor = sensor_sensitivity(seen.sensor, expected - origins)[:, :, seen.of_sensor]
         D[:, :, seen.column : seen.column + len(seen.of_sensor)] = (R_hat @ of_sensor)[:, :k]
     out.rows[:], out.points[:], out.r[:], out.origins[:] = rows, y, r, origins

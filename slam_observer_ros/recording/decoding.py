@@ -15,6 +15,8 @@ from slam_observer_ros.inputs.event_builder import Measured
 from slam_observer_ros.messages.clouds import scan_problem
 from slam_observer_ros.messages.detections import observed_tags
 from slam_observer_ros.messages.poses import (
+    decode_imu,
+    decode_odometry_pose,
     decode_poses,
     decode_transforms,
     PoseBlock,
@@ -23,7 +25,6 @@ from slam_observer_ros.messages.poses import (
 )
 from slam_observer_ros.messages.registry import BlockDecoder, Decoder, decoders
 from slam_observer_ros.messages.registry import Decode as DecodeOne
-from slam_observer_ros.messages.velocities import decode_imu, decode_odometry_pose
 from slam_observer_ros.recording.definitions import landmark_decoder
 from slam_observer_ros.recording.sources import RawBlock, RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics

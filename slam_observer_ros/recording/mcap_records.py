@@ -22,8 +22,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.recording.sources import Loss, ros2_type, Topic
 
 _MAGIC: Final = b'\x89MCAP0\r\n'
@@ -252,7 +252,7 @@ def _indexed(data: mmap.mmap, place: int) -> IntArray:
 
 
 def _begins(content: bytes, indexed: IntArray, take: _Take) -> IntArray:
-    """Return where messages begin in records: those that are indexed, and all in between."""
+    """Return where messages begin in records: indexed ones, and all in between."""
     heads = _heads(content, indexed)
     if (heads['opcode'] != Opcode.MESSAGE).any():
         raise ValueError('the index is wrong')

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from slam_observer_ros.common.errors import MessageError, RecordingError, TransformError
+from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import Event, VelocityBlock
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import (
@@ -28,8 +29,7 @@ from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock
 from slam_observer_ros.messages.registry import BlockDecoder
-from slam_observer_ros.recording.arrivals import Arrivals
-from slam_observer_ros.recording.contents import Contents
+from slam_observer_ros.recording.contents import Arrivals, Contents
 from slam_observer_ros.recording.decoding import (
     block_decoder,
     Decode,
@@ -294,7 +294,8 @@ class Recording:
             return decode(raw)
         except MessageError as error:
             if raw.topic.name not in self.malformed:
-                logger.warning('%s: malformed message on %s: %s', self.path, raw.topic, error)
+                finding = found('malformed_message', path=self.path, topic=raw.topic, error=error)
+                logger.warning('%s', finding)
             self.malformed[raw.topic.name] += 1
             return None
 
@@ -321,7 +322,7 @@ class Recording:
     def _drop(self, error: DropError) -> None:
         reason = drop_reason(error)
         if not self.dropped[reason]:
-            logger.warning('Dropped a message (%s): %s', reason, error)
+            logger.warning('%s', found('dropped_message', reason=reason, error=error))
         self.dropped[reason] += 1
 
 

@@ -12,8 +12,9 @@ from typing import TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.truth import LandmarkTruth
+from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import IMPOSSIBLE_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock
@@ -143,11 +144,6 @@ def base_in_frames(
         try:
             base_in[frame] = transforms.lookup(frame, base_frame, 0)
         except TransformError as error:
-            logger.warning(
-                "The true poses are of '%s', and the estimated ones of '%s': they are compared "
-                'as if that were one frame (%s).',
-                frame,
-                base_frame,
-                error,
-            )
+            finding = found('truth_frame', frame=frame, base_frame=base_frame, error=error)
+            logger.warning('%s', finding)
     return base_in

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from slam_observer_ros.common.errors import RecordingError
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.recording.definitions import Ros1Messages
 from slam_observer_ros.recording.sources import (

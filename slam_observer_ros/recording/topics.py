@@ -8,9 +8,9 @@ import logging
 from os.path import commonpath
 
 from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.messages.clouds import CLOUDS
-from slam_observer_ros.messages.poses import TRANSFORMS
-from slam_observer_ros.messages.velocities import ODOMETRY
+from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recording.sources import last_part, Topic
 from slam_observer_ros.settings.input_settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
 from slam_observer_ros.settings.message_types import message_types
@@ -179,12 +179,10 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
     if not fitting and len({_namespace(tree) for tree in trees}) == 1:
         fitting = trees
     if trees and not fitting:
-        logger.warning(
-            'No transforms are used: those on %s are of several robots, and none of them is in '
-            'the namespace that %s share.',
-            ', '.join(tree.name for tree in trees),
-            ' and '.join(topic.name for topic in inputs),
-        )
+        topics_of_trees = ', '.join(tree.name for tree in trees)
+        shared_by = ' and '.join(topic.name for topic in inputs)
+        finding = found('several_robots', topics=topics_of_trees, inputs=shared_by)
+        logger.warning('%s', finding)
     innermost_last = sorted(fitting, key=lambda tree: len(_namespace(tree)))
     chosen = {last_part(tree.name): (tree,) for tree in innermost_last}
     return TransformTopics(chosen.get('tf_static', ()), chosen.get('tf', ()))
@@ -207,11 +205,8 @@ def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:
         if _is_truth(topic.name) and topic.message_type not in (*poses, *CLOUDS)
     ]
     if unread:
-        logger.warning(
-            'Named like ground truth, but not of a type that true poses are read of (%s): %s.',
-            _join(poses),
-            _join(unread),
-        )
+        finding = found('unread_truth', types=_join(poses), topics=_join(unread))
+        logger.warning('%s', finding)
 
 
 def _velocity_rank(name: str) -> int:

@@ -1,8 +1,13 @@
-"""Writing of recordings: one MCAP file that ros2 bag, Foxglove and our own reader play."""
+"""Writing of recordings: one MCAP file that ros2 bag, Foxglove and our own reader play.
+
+Every public data set is read into a :class:`DataSet`, and written from it.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
@@ -27,7 +32,8 @@ from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.files import destination, unfinished_directory
-from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.evaluation.run_record import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.outgoing import OutgoingMessages
@@ -214,3 +220,49 @@ class RecordingWriter:
     def _refuse_to_overwrite(self) -> None:
         if self.path.exists() and not self._overwrite:
             raise RecordingError(f'{self.path}: exists already, and is not overwritten')
+
+
+@dataclass(frozen=True, slots=True)
+class DataSet:
+    """One run of one robot, in its body frame.
+
+    ``body_velocities`` (k, 6) are angular then linear, rad/s and m/s; ``true_poses`` (p, 4, 4)
+    body to world. The observations are in stamp order and none is empty; ``left_out`` counts
+    measurements that are no landmark observations, by reason. The truth may be empty.
+    """
+
+    velocity_stamps_ns: IntArray
+    body_velocities: FloatArray
+    observations: list[ObservationEvent]
+    truth_stamps_ns: IntArray
+    true_poses: FloatArray
+    landmarks: LandmarkTruth
+    left_out: Counter[str] = field(default_factory=Counter)
+
+
+def write_data_set(data_set: DataSet, out: Path | str, overwrite: bool = False) -> None:
+    """Write velocities, observations and truth in stamp order, with a :class:`RecordingWriter`."""
+    # At equal stamps the velocity comes first, then what is seen, then the truth.
+    velocities = [
+        VelocityEvent(stamp_ns, body_velocity)
+        for stamp_ns, body_velocity in zip(
+            data_set.velocity_stamps_ns.tolist(), data_set.body_velocities, strict=True
+        )
+    ]
+    true_poses = [
+        PoseTruth(stamp_ns, pose)
+        for stamp_ns, pose in zip(
+            data_set.truth_stamps_ns.tolist(), data_set.true_poses, strict=True
+        )
+    ]
+    items: list[VelocityEvent | ObservationEvent | PoseTruth] = [
+        *velocities,
+        *data_set.observations,
+        *true_poses,
+    ]
+    order = np.argsort([item.stamp_ns for item in items], kind='stable')
+    with RecordingWriter(out, overwrite) as writer:
+        if len(data_set.landmarks.ids):
+            writer.write_landmarks(items[order[0]].stamp_ns, data_set.landmarks)
+        for index in order:
+            writer.write_event(items[index])

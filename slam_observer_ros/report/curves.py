@@ -7,8 +7,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.consistency import average_nees_band, normalised_squared_errors
-from slam_observer_ros.evaluation.ellipses import CHI_SQUARE_95
+from slam_observer_ros.evaluation.consistency import (
+    average_nees_band,
+    CHI_SQUARE_95,
+    normalised_squared_errors,
+)
 from slam_observer_ros.runs.reported_run import ReportedRun
 
 MAX_GROUPS = 150

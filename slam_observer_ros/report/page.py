@@ -10,12 +10,12 @@ import sys
 
 import numpy as np
 
+from slam_observer_ros import __version__
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.report.curves import calibration, consistency, drops, errors, Json, rounded
 from slam_observer_ros.runs.reported_run import ReportedRun
@@ -38,7 +38,7 @@ def write_report(
 ) -> None:
     """Write the report of a run; it is whole or not there. Raises an OutputError if it can't.
 
-    ``figures`` are shown as a table; ``warnings`` are those that no finding says.
+    ``figures`` are shown as a table; ``warnings`` are what no finding says.
     """
     text = {
         'title': title,
@@ -81,7 +81,7 @@ def report_data(run: ReportedRun) -> dict[str, Json]:
     return {
         'settings': _settings(run),
         'versions': [
-            ['slam_observer_ros', VERSION],
+            ['slam_observer_ros', __version__],
             ['Python', sys.version.split()[0]],
             ['numpy', np.__version__],
         ],

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from slam_observer_ros.common.clock_jumps import is_due
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.common.stamps import is_due, NANOSECONDS_PER_SECOND
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.evaluation.truth import LandmarkTruth
+from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
-from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
-from slam_observer_ros.messages.poses import TRANSFORMS
-from slam_observer_ros.messages.state_messages import (
+from slam_observer_ros.messages.estimate_messages import (
     encode_transform,
+    EstimateMessages,
+    PATH_SPACING_NS,
     StateMessages,
     uncertain_pose,
 )
-from slam_observer_ros.messages.velocities import ODOMETRY
+from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.health import diagnostics
 

@@ -42,7 +42,7 @@ LEFT_OUT = (
     'impossible_id',
     'unweighed_point',
 )
-"""Points not used for something that is wrong; those that are not in a known map may be right."""
+"""Points not used for something that is wrong, as one that a known map has not may be right."""
 
 WRONG_IDS = ('repeated_id', 'reserved_id', 'impossible_id')
 """Of those, what a sensor should never give: one is enough to say so."""
@@ -61,8 +61,8 @@ NOTABLY_NOISIER = 1.5
 """Factor of the noise of the odometry from which it is named as a problem."""
 
 NOTABLY_WRONG, TOO_WRONG = math.sqrt(1.5), 2.0
-"""Factors of the stated noise that are worth a note, and those that neither chance nor a sensor's
-usual correlation explains."""
+"""Factors of the stated noise: what is worth a note, and what neither chance nor a sensor's usual
+correlation explains."""
 
 NOISELESS = 0.01
 """Share of the stated noise below which there is none at all."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
-from slam_observer_ros.recording.arrivals import Arrivals
+from slam_observer_ros.recording.contents import Arrivals
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.replay import Replay

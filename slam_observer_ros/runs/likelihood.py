@@ -67,7 +67,7 @@ class LikelihoodRecorder:
         self._shares: list[FloatArray] = []
 
     def note_update(self, update: Update) -> None:
-        """Take in an observation, of which the estimator has judged the innovation."""
+        """Take in an observation, whose innovation the estimator has judged."""
         innovation = update.innovation
         if innovation is None:
             return

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import RangePower, Update
 from slam_observer_ros.events import flatten, ObservationEvent
 from slam_observer_ros.geometry import se3
@@ -23,6 +23,9 @@ MAX_WAITING = 100
 
 MAX_OBSERVATIONS = 20_000
 """Observations that are looked at, from the start of the run."""
+
+MOST_UNCOMPARED = 64
+"""Observations whose ranges are compared at once."""
 
 MIN_POINTS, PARTS = 200, 20
 """Least number of points that says something, and the parts of them that scatter."""
@@ -45,11 +48,13 @@ class RangeErrors:
         self._waiting: deque[ObservationEvent] = deque(maxlen=MAX_WAITING)
         self._errors: list[FloatArray] = []
         self._log_cosines: list[FloatArray] = []
-        self._points = self._behind = 0
+        # Of each observation: points as shown and as estimated (m, 3), from the sensor, and cos b.
+        self._uncompared: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self._count = self._points = self._behind = 0
 
     def note_event(self, event: ObservationEvent) -> None:
         """Take in an observation that is going to be used."""
-        if len(self._errors) < MAX_OBSERVATIONS:
+        if self._count < MAX_OBSERVATIONS:
             self._waiting.append(flatten(event) if self._is_planar else event)
 
     def note_update(self, update: Update, known: IntArray, world_points: FloatArray) -> None:
@@ -58,19 +63,27 @@ class RangeErrors:
         if event is None:
             return
         self._waiting.remove(event)
-        if not len(known):
+        if not len(known) or not len(event.ids):
             return
-        seen, by_id = np.argsort(event.ids), np.argsort(known)
-        ids = event.ids[seen]
-        at = by_id.take(known[by_id].searchsorted(ids), mode='clip')
-        is_used = (known[at] == ids) & np.isin(ids, update.ids)
+        (seen, were_seen), (at, are_known) = _find(update.ids, event.ids), _find(update.ids, known)
+        is_used = were_seen & are_known
         if not np.count_nonzero(is_used):
             return
         seen, at = seen[is_used], at[is_used]
         points = se3.transform(se3.inverse(update.pose), world_points[at])
         shown = event.lines_of_sight[seen]
-        arms = points - (event.points - event.lines_of_sight)[seen]
-        cosine = cosines(arms, event.sensor_axis)
+        arms = points if event.sensor is None else points - event.sensor[seen]
+        self._uncompared.append((shown, arms, cosines(arms, event.sensor_axis)))
+        self._count += 1
+        if len(self._uncompared) == MOST_UNCOMPARED:
+            self._compare()
+
+    def _compare(self) -> None:
+        """Take the ranges of several observations at once: one by one costs more."""
+        none = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
+        columns = zip(none, *self._uncompared, strict=True)
+        shown, arms, cosine = (np.concatenate(parts) for parts in columns)
+        self._uncompared.clear()
         is_behind = cosine <= LEAST_COSINE
         self._points += len(cosine)
         self._behind += int(np.count_nonzero(is_behind))
@@ -84,6 +97,7 @@ class RangeErrors:
     @property
     def power(self) -> RangePower | None:
         """q; None where the sensor sees all around, or not far enough off its axis."""
+        self._compare()
         none = np.empty(0)
         errors = np.concatenate([none, *self._errors])
         x = np.concatenate([none, *self._log_cosines])
@@ -98,3 +112,10 @@ class RangeErrors:
         value = float(x.dot(errors)) / information
         scores = [part.sum() for part in np.array_split(x * (errors - value * x), PARTS)]
         return RangePower(value, math.sqrt(float(np.dot(scores, scores))) / information)
+
+
+def _find(wanted: IntArray, ids: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return at which rows of ``ids`` (n,), n > 0, wanted ones (m,) are, and whether they are."""
+    order = np.argsort(ids)
+    rows = order.take(ids[order].searchsorted(wanted), mode='clip')
+    return rows, ids[rows] == wanted

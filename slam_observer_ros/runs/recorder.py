@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import is_due
+from slam_observer_ros.common.stamps import is_due
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.run_record import Innovations, Instant
@@ -33,7 +33,7 @@ class RunRecorder:
         self._period_ns = FIRST_PERIOD_NS
 
     def note_update(self, update: Update) -> None:
-        """Take in an observation, of which the estimator has judged the innovation."""
+        """Take in an observation, whose innovation the estimator has judged."""
         if len(update.ids):
             self._updates.append(update)
 
@@ -106,7 +106,7 @@ class NisTally:
         self._nis, self._degrees_of_freedom = 0.0, 0
 
     def note_update(self, update: Update) -> None:
-        """Take in an observation, of which the estimator has judged the innovation."""
+        """Take in an observation, whose innovation the estimator has judged."""
         innovation = update.innovation
         if innovation is not None and innovation.nis is not None:
             self._nis += innovation.nis

@@ -14,11 +14,11 @@ from typing import ParamSpec, Protocol, runtime_checkable
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import RangePower, Update, used_points
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityBlock
 from slam_observer_ros.known_map.landmark_map import LandmarkMap

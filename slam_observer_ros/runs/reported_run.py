@@ -10,9 +10,8 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
-from slam_observer_ros.evaluation.run_record import Innovations, Instant
+from slam_observer_ros.evaluation.run_record import Innovations, Instant, LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import due_rows
+from slam_observer_ros.common.stamps import due_rows, NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
@@ -75,26 +74,48 @@ class TrajectorySampler:
         return np.array([latest[stamp_ns] for stamp_ns in sorted(latest)])
 
 
+MOST_PENDING = 64
+"""Motions that are worked off at once: one by one costs three times as much."""
+
+
 class DeadReckoning:
     """Collects the poses that the velocities alone lead through, from the identity on."""
 
     def __init__(self, keep_all: bool = True) -> None:
         self._pose = np.eye(4)
         self._samples = PoseSamples(keep_all)
+        self._pending: list[tuple[FloatArray, IntArray]] = []
+        self._most_pending = MOST_PENDING if keep_all else 1
+        self._has_begun = False
+        self._end_ns = 0
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move on from one stamp to another, nanoseconds."""
         held = velocities.held(start_ns, end_ns)
-        if not (self._samples.stamps_ns or held.dt_s.any()):
+        self._has_begun = self._has_begun or bool(held.dt_s.any())
+        if not self._has_begun:
             return
-        path = se3.path(self._pose, held.body_velocities * held.dt_s[:, None])
+        if start_ns != self._end_ns or len(self._pending) == self._most_pending:
+            self._move_on()
         elapsed_s = np.append(0.0, np.cumsum(held.dt_s + held.gap_s))
         stamps_ns = start_ns + np.rint(elapsed_s * NANOSECONDS_PER_SECOND).astype(np.int64)
-        rows = self._samples.due(stamps_ns)
-        self._samples.add(stamps_ns[rows], path[rows])
+        self._pending.append((held.body_velocities * held.dt_s[:, None], stamps_ns))
+        self._end_ns = end_ns
+
+    def _move_on(self) -> None:
+        """Work off motions that follow each other, each from where the one before it ended."""
+        if not self._pending:
+            return
+        twists, stamps_ns = zip(*self._pending, strict=True)
+        self._pending.clear()
+        path = se3.path(self._pose, np.concatenate(twists))
+        at_ns = np.concatenate([stamps_ns[0][:1], *(each[1:] for each in stamps_ns)])
+        rows = self._samples.due(at_ns)
+        self._samples.add(at_ns[rows], path[rows])
         self._pose = se3.pose(so3.normalise(path[-1, :3, :3]), path[-1, :3, 3])
 
     @property
     def trajectory(self) -> Trajectory:
         """The poses kept, in stamp order."""
+        self._move_on()
         return self._samples.trajectory

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes

@@ -20,8 +20,8 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory

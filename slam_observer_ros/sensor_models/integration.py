@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities

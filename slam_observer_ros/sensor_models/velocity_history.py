@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass, fields
 import math
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_s
-from slam_observer_ros.events import (
-    AngularVelocityEvent,
-    flatten_velocities,
-    VelocityBlock,
-    VelocityEvent,
-)
+from slam_observer_ros.events import AngularVelocityEvent, flatten_velocities, VelocityBlock
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
 
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
@@ -49,10 +43,10 @@ class Velocities(NamedTuple):
 
 
 class VelocityHistory:
-    """Velocity events in stamp order, joined with the angular velocities of another sensor.
+    """Velocities in stamp order, joined with the angular velocities of another sensor.
 
     A velocity is held for ``timeout_ns`` at most. Where the other sensor's angular one was older
-    when an event came, the velocity's own angular part counts. With ``is_planar`` only what is in
+    when it came, the velocity's own angular part counts. With ``is_planar`` only what is in
     the plane z = 0 counts.
     """
 
@@ -60,52 +54,56 @@ class VelocityHistory:
         self._timeout_ns = timeout_ns
         self._is_planar = is_planar
         # In force from each stamp to the next; the first is what is known before any event.
-        self._stamps_ns = [NEVER_NS]
-        self._joined = _Joined.with_room_for(FIRST_CAPACITY)
-        # Nobody has asked for these yet: many written at once cost less than one by one.
-        self._unwritten: list[_InForce] = []
-        self._velocity: VelocityEvent | None = None
+        self._joined, self._count = _Joined.with_room_for(FIRST_CAPACITY), 1
         self._angular: AngularVelocityEvent | None = None
         self._periods, self._angular_periods = _Periods(), _Periods()
 
-    def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
-        """Add an event that is not earlier than any other; return whether it leads on.
+    def append(self, measured: VelocityBlock | AngularVelocityEvent) -> bool:
+        """Add what is not earlier than anything else; return whether it leads on.
 
         An angular velocity does not before the first linear one is known: it waits for that.
         """
-        if isinstance(event, AngularVelocityEvent):
-            self._angular_periods.add(event.stamp_ns)
-            self._angular = event
+        if isinstance(measured, AngularVelocityEvent):
+            self._angular_periods.add(measured.stamp_ns)
+            self._angular = measured
+            if self._count == 1:
+                return False
+            rows = self._new_rows(1)
+            self._joined.repeat_last(rows.start, measured.stamp_ns)
+            self._joined.usual_s[rows] = self._usual_s()
         else:
-            if not event.is_mean:  # else its error does not go on, however long it is held
-                self._periods.add(event.stamp_ns)
-            self._velocity = event
-        if self._velocity is None:
-            return False
-        angular = self._angular
-        if angular is not None and not 0 <= event.stamp_ns - angular.stamp_ns <= self._timeout_ns:
-            angular = None
-        self._unwritten.append((self._velocity, angular, self._usual_s()))
-        self._stamps_ns.append(event.stamp_ns)
+            rows = self._new_rows(len(measured))
+            self._joined.write(rows, measured, self._took(measured))
+            if self._angular is not None:
+                self._joined.usual_s[rows, 0] = self._angular_periods.usual_s
+        if (angular := self._angular) is not None:
+            stamps_ns = self._joined.stamps_ns[rows]
+            begin = stamps_ns.searchsorted(angular.stamp_ns)
+            end = stamps_ns.searchsorted(angular.stamp_ns + self._timeout_ns, 'right')
+            self._joined.write_angular(slice(rows.start + begin, rows.start + end), angular)
         return True
 
-    @property
-    def is_of_one_sensor(self) -> bool:
-        """Whether there was no angular velocity of another sensor."""
-        return self._angular is None
+    def _new_rows(self, k: int) -> slice:
+        """Make room for so many more."""
+        first, self._count = self._count, self._count + k
+        if self._count > self._joined.capacity:
+            self._joined = self._joined.copied(slice(first), 2 * self._count)
+        return slice(first, self._count)
 
-    def append_velocities(self, velocities: VelocityBlock) -> None:
-        """Add velocities that are of one sensor as :meth:`append` adds each of them."""
-        self._written()
-        stamps_ns, first = velocities.stamps_ns.tolist(), len(self._stamps_ns)
-        self._stamps_ns += stamps_ns
-        usual_s = [self._periods.add(stamp_ns) for stamp_ns in stamps_ns]
-        self._written().write_velocities(first, velocities, usual_s)
-        (self._velocity,) = velocities.part(slice(-1, None)).events()
+    def _took(self, velocities: VelocityBlock) -> FloatArray | float:
+        """Return for how long each was in force as a rule when these came, (k, 1) seconds."""
+        if velocities.is_mean:  # their errors do not go on, however long they are held
+            return self._periods.usual_s
+        usual_s = [self._periods.add(stamp_ns) for stamp_ns in velocities.stamps_ns.tolist()]
+        return usual_s[0] if len(usual_s) == 1 else np.array(usual_s)[:, None]
+
+    def _row(self, stamp_ns: int, side: Literal['left', 'right'] = 'right') -> int:
+        """Return the first row behind a stamp, or with ``'left'`` the first at it or behind."""
+        return int(self._joined.stamps_ns[: self._count].searchsorted(stamp_ns, side))
 
     def latest(self, stamp_ns: int) -> FloatArray | None:
         """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
-        row, joined = bisect_right(self._stamps_ns, stamp_ns) - 1, self._written()
+        row, joined = self._row(stamp_ns) - 1, self._joined
         if stamp_ns - joined.since_ns[row, 1] > self._timeout_ns:
             return None
         return self._counting(joined.body_velocities[row])
@@ -115,10 +113,10 @@ class VelocityHistory:
 
         It is in the gap between messages if it has timed out; None if no two are known yet.
         """
-        row, joined = bisect_right(self._stamps_ns, stamp_ns) - 1, self._written()
+        row, joined = self._row(stamp_ns) - 1, self._joined
         period_s = self._periods.usual_s
         if math.isinf(period_s):  # of means over time, which have none
-            period_s = to_s(self._stamps_ns[row] - self._stamps_ns[row - 1])
+            period_s = to_s(int(joined.stamps_ns[row] - joined.stamps_ns[row - 1]))
         if row < 2 or period_s <= 0.0:
             return None
         one = slice(row, row + 1)
@@ -152,14 +150,14 @@ class VelocityHistory:
             whole=self._held(self._cut(slice(first, first + k), begins[:k], begins[1 : k + 1])),
             last=self._held(self._cut(first + counts, begins[counts], ends_ns)),
             counts=counts,
-            usual_s=self._written().usual_s[first + known],
+            usual_s=self._joined.usual_s[first + known],
         )
 
     def means_until(self, centres_ns: IntArray, reach_ns: int, stamps_ns: IntArray) -> FloatArray:
         """Return :meth:`mean` around centres (s,), had it been asked at increasing stamps (s,)."""
         starts_ns, ends_ns = centres_ns - reach_ns, centres_ns + reach_ns
         stamps, first, known = self._known_at(stamps_ns, int(starts_ns.min()))
-        joined = self._written()
+        joined = self._joined
         velocities = self._counting(joined.body_velocities[first : first + len(stamps)])
         stops = joined.since_ns[first : first + len(stamps), 1] + self._timeout_ns
         # How long a velocity was known, and how far it led, until each of their stamps, …
@@ -181,12 +179,8 @@ class VelocityHistory:
 
     def between(self, start_ns: int, end_ns: int) -> tuple[IntArray, FloatArray]:
         """Return stamps and measured velocities (m, 6) of those in force between two stamps."""
-        rows = slice(
-            max(bisect_right(self._stamps_ns, start_ns) - 1, 1),
-            bisect_right(self._stamps_ns, end_ns),
-        )
-        stamps = np.array(self._stamps_ns[rows], dtype=np.int64)
-        return stamps, self._written().body_velocities[rows]
+        rows = slice(max(self._row(start_ns) - 1, 1), self._row(end_ns))
+        return self._joined.stamps_ns[rows], self._joined.body_velocities[rows]
 
     def _known_at(self, stamps_ns: IntArray, start_ns: int) -> tuple[IntArray, int, IntArray]:
         """Return stamps of velocities, the row of the first, and which was the latest at each.
@@ -194,14 +188,13 @@ class VelocityHistory:
         From the one in force at ``start_ns`` on, or known at the first of ``stamps_ns`` (s,).
         """
         earliest_ns, latest_ns = min(start_ns, int(stamps_ns[0])), int(stamps_ns[-1])
-        first = bisect_right(self._stamps_ns, earliest_ns) - 1
-        last = bisect_right(self._stamps_ns, latest_ns)
-        stamps = np.array(self._stamps_ns[first:last], dtype=np.int64)
+        first = self._row(earliest_ns) - 1
+        stamps = self._joined.stamps_ns[first : self._row(latest_ns)]
         return stamps, first, stamps.searchsorted(stamps_ns, 'right') - 1
 
     def flat(self) -> Velocities:
         """Return all that are known as plain arrays."""
-        return self._flat(len(self._stamps_ns), *self._usual_s())
+        return self._flat(self._count, *self._usual_s())
 
     def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
         """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
@@ -213,7 +206,7 @@ class VelocityHistory:
 
     def _flat(self, count: int, usual_angular_s: float, usual_linear_s: float) -> Velocities:
         """Return the first so many."""
-        joined = self._written()
+        joined = self._joined
         return Velocities(
             joined.stamps_ns[:count],
             joined.body_velocities[:count],
@@ -231,24 +224,24 @@ class VelocityHistory:
         known_ns = held_ns.sum()
         if known_ns == 0.0:
             return np.zeros(6)
-        return self._counting(held_ns.dot(self._written().body_velocities[pieces.rows]) / known_ns)
+        return self._counting(held_ns.dot(self._joined.body_velocities[pieces.rows]) / known_ns)
 
     @property
     def begins_ns(self) -> int | None:
         """Stamp since which velocities are known, nanoseconds; None while there are none."""
-        return self._stamps_ns[1] if len(self._stamps_ns) > 1 else None
+        return int(self._joined.stamps_ns[1]) if self._count > 1 else None
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
-        first, count = bisect_right(self._stamps_ns, stamp_ns) - 1, len(self._stamps_ns)
+        first, count = self._row(stamp_ns) - 1, self._count
         if first > count // 2:
-            kept, joined = np.append(0, np.arange(first, count)), self._written()
-            self._joined = joined.copied(kept, joined.capacity)
-            del self._stamps_ns[1:first]
+            kept = np.append(0, np.arange(first, count))
+            self._joined = self._joined.copied(kept, self._joined.capacity)
+            self._count = len(kept)
 
     def _held(self, pieces: _Pieces) -> HeldVelocities:
         rows, begins_ns, stops_ns, ends_ns = pieces
-        joined = self._written()
+        joined = self._joined
         before_ns = begins_ns[:, None] - joined.since_ns[rows]
         dt_s, gap_s, *before_s = to_s(
             np.array([stops_ns - begins_ns, ends_ns - stops_ns, *before_ns.T])
@@ -264,30 +257,18 @@ class VelocityHistory:
         )
 
     def _pieces(self, start_ns: int, end_ns: int) -> _Pieces:
-        first = bisect_right(self._stamps_ns, start_ns) - 1
-        last = bisect_left(self._stamps_ns, end_ns)
-        stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
+        first, last = self._row(start_ns) - 1, self._row(end_ns, 'left')
+        stamps: IntArray = np.append(self._joined.stamps_ns[first:last], end_ns)
         return self._cut(slice(first, last), np.maximum(stamps[:-1], start_ns), stamps[1:])
 
     def _cut(self, rows: slice | IntArray, begins: IntArray, ends: IntArray) -> _Pieces:
-        timed_out = self._written().since_ns[rows, 1] + self._timeout_ns
+        timed_out = self._joined.since_ns[rows, 1] + self._timeout_ns
         return _Pieces(rows, begins, np.minimum(np.maximum(timed_out, begins), ends), ends)
 
     def _usual_s(self) -> tuple[float, float]:
         linear_s = self._periods.usual_s
         angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
         return angular_s, linear_s
-
-    def _written(self) -> _Joined:
-        """Return all velocities, including what has come since the last time."""
-        count = len(self._stamps_ns)
-        if count > self._joined.capacity:
-            self._joined = self._joined.copied(slice(None), 2 * count)
-        if self._unwritten:
-            first = count - len(self._unwritten)
-            self._joined.write(first, self._stamps_ns[first:], self._unwritten)
-            self._unwritten = []
-        return self._joined
 
     def _counting(self, body_velocities: FloatArray) -> FloatArray:
         """Return what counts of velocities (…, 6), as a copy: for all of a step at once."""
@@ -330,10 +311,6 @@ class _Periods:
         if len(longest_ns) == 2:
             self._usual_ns = longest_ns[0]
             self.usual_s = to_s(longest_ns[0]) or math.inf
-
-
-_InForce: TypeAlias = tuple[VelocityEvent, AngularVelocityEvent | None, tuple[float, float]]
-"""What is in force from a stamp on, and for how long that is as a rule, by part, seconds."""
 
 
 class _Pieces(NamedTuple):
@@ -384,40 +361,28 @@ class _Joined:
             getattr(roomy, field.name)[: len(kept)] = kept
         return roomy
 
-    def write_velocities(
-        self, first: int, velocities: VelocityBlock, usual_s: list[float]
-    ) -> None:
-        """As :meth:`write`, of velocities of one sensor."""
-        rows, covariances = slice(first, first + len(velocities)), velocities.covariances
-        self.body_velocities[rows] = velocities.body_velocities
+    def write(self, rows: slice, velocities: VelocityBlock, usual_s: FloatArray | float) -> None:
+        """Fill in rows, once: others may see them."""
         self.stamps_ns[rows] = velocities.stamps_ns
+        self.body_velocities[rows] = velocities.body_velocities
         self.since_ns[rows] = velocities.stamps_ns[:, None]
-        self.usual_s[rows] = np.array(usual_s)[:, None]
-        if covariances is not None:
+        self.usual_s[rows] = usual_s
+        if (covariances := velocities.covariances) is not None:
             self.covariances[rows] = covariances
             self.is_stated[rows, 0] = covariances[:, :3, :3].any(axis=(1, 2))
             self.is_stated[rows, 1] = covariances[:, 3:, 3:].any(axis=(1, 2))
 
-    def write(self, first: int, in_force_ns: list[int], events: list[_InForce]) -> None:
-        """Fill in rows from ``first`` on, once: others may see them."""
-        rows = slice(first, first + len(events))
-        self.body_velocities[rows] = [velocity.body_velocity for velocity, *_ in events]
-        stamps_ns = np.array([velocity.stamp_ns for velocity, *_ in events], dtype=np.int64)
-        self.stamps_ns[rows] = in_force_ns
-        self.since_ns[rows] = stamps_ns[:, None]
-        self.usual_s[rows] = [usual_s for *_, usual_s in events]
-        for row, (velocity, angular, _) in enumerate(events, first):
-            if (stated := velocity.covariance) is not None:
-                self.covariances[row] = stated
-                self.is_stated[row] = stated[:3, :3].any(), stated[3:, 3:].any()
-            if angular is not None:
-                self._write_angular(row, angular)
+    def repeat_last(self, row: int, stamp_ns: int) -> None:
+        """Fill in a row with what is in force before it, from a stamp on."""
+        for array in (self.body_velocities, self.covariances, self.is_stated, self.since_ns):
+            array[row] = array[row - 1]
+        self.stamps_ns[row] = stamp_ns
 
-    def _write_angular(self, row: int, angular: AngularVelocityEvent) -> None:
-        """Put the other sensor's angular velocity in place of the velocity's own."""
+    def write_angular(self, rows: slice, angular: AngularVelocityEvent) -> None:
+        """Put the other sensor's angular velocity in place of the velocities' own."""
         is_stated = angular.covariance is not None and bool(angular.covariance.any())
-        self.body_velocities[row, :3] = angular.angular_velocity
-        self.covariances[row, :3] = self.covariances[row, :, :3] = 0.0
-        self.covariances[row, :3, :3] = angular.covariance if is_stated else 0.0
-        self.is_stated[row, 0] = is_stated
-        self.since_ns[row, 0] = angular.stamp_ns
+        self.body_velocities[rows, :3] = angular.angular_velocity
+        self.covariances[rows, :3] = self.covariances[rows, :, :3] = 0.0
+        self.covariances[rows, :3, :3] = angular.covariance if is_stated else 0.0
+        self.is_stated[rows, 0] = is_stated
+        self.since_ns[rows, 0] = angular.stamp_ns

@@ -59,7 +59,7 @@ def register(message_type: MessageType) -> None:
 
 
 def message_types(role: Role) -> dict[str, MessageType]:
-    """Return the types of which something is read, by name.
+    """Return the types that are read, or a part of them, by name.
 
     Where a live topic carries several the first is taken: they are in the order of the decoders'
     modules, and in these as they are written.

@@ -106,8 +106,8 @@ class ObserverNodeSettings(InputSettings):
     )
     map_file: str = parameter(
         '',
-        'Map to load at the start: one saved earlier, or surveyed landmarks; a folder of maps, in '
-        'one of which the robot is found; empty for none',
+        'Map to load at the start: one saved earlier, or surveyed landmarks; or a folder of maps, '
+        'and the robot is found in one of them; empty for none',
         basic=True,
     )
     map_path: str = parameter(

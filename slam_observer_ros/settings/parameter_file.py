@@ -1,4 +1,4 @@
-"""ROS 2 parameter files, read without ROS."""
+"""ROS 2 parameter files, read and written without ROS."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 import re
 import textwrap
 
-from slam_observer_ros.common.errors import ParameterError, shown, YamlError
+from slam_observer_ros.common.errors import OutputError, ParameterError, shown, YamlError
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.settings.parameter_table import (
     Parameter,
@@ -215,3 +216,29 @@ def value_text(value: object) -> str:
         mantissa, e, exponent = repr(value).partition('e')
         return mantissa if not e else f'{mantissa}{"" if "." in mantissa else ".0"}e{exponent}'
     return json.dumps(value, ensure_ascii=False)
+
+
+def write_found(
+    path: Path,
+    head: Sequence[str],
+    given: Mapping[str, object],
+    found: Sequence[tuple[str, Mapping[str, object]]],
+) -> None:
+    """Write parameters as given but for those found, which have a comment for each group."""
+    names = {name for _, values in found for name in values}
+    lines = [*(f'# {line}' for line in head), '/**:', '  ros__parameters:']
+    others = {name: value for name, value in given.items() if name not in names}
+    if others:
+        lines += ['    # As it was given', *(_entry(name, others[name]) for name in others)]
+    for comment, values in found:
+        lines += ['', *(f'    # {line}' for line in comment.splitlines())]
+        lines += [_entry(name, value) for name, value in values.items()]
+    try:
+        with unfinished_file(path) as file:
+            file.write('\n'.join(lines) + '\n')
+    except OSError as error:
+        raise OutputError(f"can't write {path}: {error.strerror}") from error
+
+
+def _entry(name: str, value: object) -> str:
+    return f'    {name}: {value_text(value)}'

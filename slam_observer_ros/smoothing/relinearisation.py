@@ -336,9 +336,7 @@ class Relinearisation:
         """Return what is known now."""
         observer, joint = self._observer, self._joint
         points = observer.points[:0] if self._is_given_up else observer.points
-        P = joint.P[: joint.first, : joint.first]
-        if not self._is_given_up:
-            P = joint.of_positions(points)
+        P = joint.of_robot if self._is_given_up else joint.of_positions(points)
         P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)
         values = self._calibration.values
         return Prior(observer.A.copy(), values, points, P, orientations=self._orientations())

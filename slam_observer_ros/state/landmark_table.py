@@ -6,9 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from slam_observer_ros.common.columns import LandmarkColumns
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, LandmarkColumns
 from slam_observer_ros.events import is_automatic
 
 PATIENCE = 4

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.sensor_mounting import Sensed
@@ -101,9 +101,8 @@ def _led_to(
     if errors is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
     # Landmarks have no part in it.
-    joint = errors.joint
-    P = joint.P[: joint.first, : joint.first].copy()
-    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, joint.first, joint.first)
+    P = errors.joint.of_robot.copy()
+    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, len(P), len(P))
     status, out = _advanced(state, x, velocities, start_ns, end_ns)
     if status == step.UNUSUAL:
         return None

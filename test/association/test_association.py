@@ -14,7 +14,9 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
+from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
+from slam_observer_ros.association.hypothesis import FieldOfView, LandmarkIndex, Visibility
 from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
@@ -25,16 +27,14 @@ from slam_observer_ros.association.joint_compatibility import (
     Pairs,
     PRUNING_COST,
 )
-from slam_observer_ros.association.landmark_index import LandmarkIndex
-from slam_observer_ros.association.new_landmarks import NewLandmarks
-from slam_observer_ros.association.visibility import FieldOfView, Visibility
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
     ObservationEvent,
+    queued,
     UNKNOWN_ID,
     VelocityEvent,
 )
@@ -42,7 +42,7 @@ from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.recording.mrclam import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
@@ -748,7 +748,7 @@ def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved
     for hypothesis, yaw_rad in zip(hypotheses._all, [0.0, 0.4], strict=True):
         hypothesis.state.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
     velocities, end_ns = VelocityHistory(10**10), 6 * 10**9
-    velocities.append(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
+    velocities.append(queued(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))))
     _, before = hypotheses.pose_after(velocities, 0, end_ns)
     hypotheses.propagate(velocities, 0, end_ns)
     assert_allclose(before, hypotheses.pose_after(velocities, end_ns, end_ns)[1], atol=1e-9)

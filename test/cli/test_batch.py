@@ -20,14 +20,13 @@ import numpy as np
 import pytest
 from recordings import events, write_mcap, write_rosbag1
 
-from slam_observer_ros.cli.batch.index import write_index
-from slam_observer_ros.cli.batch.jobs import grid_points, part_of
-from slam_observer_ros.cli.batch.pool import local_pool
-from slam_observer_ros.cli.batch.run_log import opened_log, read_logs
-from slam_observer_ros.cli.figures import FIGURES
+from slam_observer_ros.cli.batch_index import write_index
+from slam_observer_ros.cli.batch_jobs import grid_points, opened_log, part_of, read_logs
+from slam_observer_ros.cli.batch_pool import local_pool
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.runs.accuracy import FIGURES
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 PATIENCE_S = 60.0

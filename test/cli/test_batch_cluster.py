@@ -12,7 +12,7 @@ import time
 from command_line import CommandLine
 import pytest
 
-from slam_observer_ros.cli.batch.run_log import read_logs
+from slam_observer_ros.cli.batch_jobs import read_logs
 
 pytest.importorskip('distributed', reason="no Dask is installed (pip's extra 'cluster')")
 

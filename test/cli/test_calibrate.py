@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from slam_observer_ros.cli.calibrate.driven import driven, opened
-from slam_observer_ros.cli.calibrate.trades import trades
+from slam_observer_ros.cli.calibration_finder import driven, opened
+from slam_observer_ros.cli.calibration_stated import trades
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import so3

@@ -236,7 +236,7 @@ def test_tags_that_tf_does_not_have_are_dropped_and_reported(recordings, slam_ob
     assert ended.code == 0
     assert ended.json['landmarks'] == 0
     assert ended.json['dropped'] == {'no_transform': 41}
-    assert ended.errors.count('Dropped a message (no_transform)') == 1
+    assert ended.errors.count('Dropped a message, no_transform: ') == 1
     assert 'fiducials are where /tf has them, which was not recorded' in ended.errors
 
 

@@ -9,7 +9,7 @@ import pytest
 import ros_messages as ros
 from tum_files import read_tum
 
-from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
+from slam_observer_ros.evaluation.run_record import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.reader import Recording
@@ -132,7 +132,8 @@ class TestMovingMounts:
         assert ended.code == 0
         assert ended.json['dropped'] == {'no_transform': STEPS}
         assert ended.json['events'] == 2 * STEPS
-        assert ended.errors.count('Dropped a message (no_transform)') == 1
+        assert ended.errors.count('Dropped a message, no_transform: ') == 1
+        assert 'dropped_message' in [finding['kind'] for finding in ended.json['findings']]
         assert "'camera' and 'base_link' are not connected" in ended.errors
 
     def test_what_still_waits_at_the_end_is_dropped(self, slam_observer, tmp_path):
@@ -303,7 +304,7 @@ class TestVelocities:
         options = ('--json', '--velocity-source', 'pose_differences')
         ended = slam_observer('replay', path, *options)
         assert ended.json['dropped'] == {'pose_jump': 1}
-        assert ended.errors.count('Dropped a message (pose_jump)') == 1
+        assert ended.errors.count('Dropped a message, pose_jump: ') == 1
         assert ended.json['dead_reckoning_ate_rmse_m'] < 0.01
 
     def test_an_imu_with_the_stamps_of_the_odometry_turns_it_at_once(

@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 import yaml
 
-from slam_observer_ros.cli.tune.noise_kinds import kinds_of, scaled
-from slam_observer_ros.cli.tune.search import most_likely, remembered, without_effect
-from slam_observer_ros.cli.tune.verdict import judge, Judged
+from slam_observer_ros.cli.held_out import judge, Judged
+from slam_observer_ros.cli.noise_tuning import (
+    kinds_of,
+    most_likely,
+    remembered,
+    scaled,
+    without_effect,
+)
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.likelihood import Likelihood

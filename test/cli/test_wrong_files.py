@@ -167,7 +167,7 @@ def test_a_folder_of_figures_is_no_other_output(slam_observer, recording, words)
 
 
 def test_what_is_held_out_is_read_before_the_search(slam_observer, recording, monkeypatch):
-    monkeypatch.setattr('slam_observer_ros.cli.tune.search.most_likely', None)
+    monkeypatch.setattr('slam_observer_ros.cli.noise_tuning.most_likely', None)
     words = ('tune', recording, '--hold-out')
     assert 'nothing.mcap: no such file' in slam_observer.fail(*words, 'nothing.mcap')
     assert 'a recording is given twice' in slam_observer.fail(*words, SAMPLE)

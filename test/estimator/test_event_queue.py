@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.stamps import AGREEING_STAMPS
 from slam_observer_ros.estimator.event_queue import EventQueue, MIN_KNOWN
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     ObservationEvent,
+    queued,
+    VelocityBlock,
     VelocityEvent,
 )
 
@@ -24,11 +26,13 @@ START_NS = 1_700_000_000 * SECOND
 
 
 def velocity(stamp_ns):
-    return VelocityEvent(START_NS + stamp_ns, np.zeros(6))
+    return queued(VelocityEvent(START_NS + stamp_ns, np.zeros(6)))
 
 
 def received(event, receive_ns):
-    return dataclasses.replace(event, receive_ns=receive_ns)
+    is_block = isinstance(event, VelocityBlock)
+    times_ns = np.array([receive_ns]) if is_block else receive_ns
+    return dataclasses.replace(event, receive_ns=times_ns)
 
 
 def observation(stamp_ns, ids=(1,), range_m=0.0):

@@ -7,7 +7,7 @@ import pytest
 
 from slam_observer_ros.evaluation.consistency import shape_covariances
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.geometry.se3 import rigid_alignment
 
 GENERATOR = np.random.default_rng(3)
 POINTS = GENERATOR.normal(size=(6, 3)) * 5.0

@@ -11,9 +11,9 @@ from strategies import generators, poses
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation import consistency, metrics
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError, MAX_JOINT
+from slam_observer_ros.evaluation.metrics import ConfigurationError, MAX_JOINT
+from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
 

@@ -16,11 +16,9 @@ import pytest
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation import map_plot, replay_plots, simulation_plots
 from slam_observer_ros.evaluation.consistency import nees_over_time
-from slam_observer_ros.evaluation.metrics import Decay, fit_decay, trajectory_errors
-from slam_observer_ros.evaluation.plots import map_plot, replay_plots, simulation_plots
-from slam_observer_ros.evaluation.plots.drawing import (
+from slam_observer_ros.evaluation.drawing import (
     BLACK,
     BLUE,
     GREEN,
@@ -30,9 +28,14 @@ from slam_observer_ros.evaluation.plots.drawing import (
     PURPLE,
     RED,
 )
-from slam_observer_ros.evaluation.run_record import Innovations
+from slam_observer_ros.evaluation.metrics import (
+    ConfigurationError,
+    Decay,
+    fit_decay,
+    trajectory_errors,
+)
+from slam_observer_ros.evaluation.run_record import Innovations, LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -461,7 +464,7 @@ def test_matplotlibs_settings_and_backend_stay_as_they_were(tmp_path: Path) -> N
     before = dict(mpl.rcParams)
     simulation_plots.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, -SECONDS)
     assert dict(mpl.rcParams) == before
-    module = 'slam_observer_ros.evaluation.plots.replay_plots'
+    module = 'slam_observer_ros.evaluation.replay_plots'
     program = f"import sys, {module}; print('matplotlib.pyplot' in sys.modules)"
     result = subprocess.run(
         [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60

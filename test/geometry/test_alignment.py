@@ -10,7 +10,7 @@ from strategies import generators, poses, rotations
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.geometry.se3 import rigid_alignment
 
 
 @given(generators(), poses(), st.integers(3, 40), st.sampled_from([1e-3, 1.0, 1e4]))

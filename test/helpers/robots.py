@@ -9,7 +9,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import PointCloud, PointCloud2
 
-from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
+from slam_observer_ros.common.stamps import AGREEING_STAMPS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.messages.poses import pose_matrices

@@ -34,7 +34,8 @@ def random_estimate(rng, n=None):
     estimated = np.sort(np.append(velocity_entries, 12)).astype(np.int64)
     c = len(estimated) + int(rng.integers(0, 4))
     n = int(rng.integers(1, 40)) if n is None else n
-    size = p + c + k * n
+    first = p + c + int(rng.integers(0, 9)) * int(rng.integers(2))  # with what is postponed
+    size = first + k * n
     room = size + int(rng.integers(0, 9))
     P = np.zeros((room, room))
     P[:size, :size] = random_covariance(rng, size)
@@ -45,7 +46,7 @@ def random_estimate(rng, n=None):
         A = se3.flatten(A)
         y_ref[:, 2] = a[:, 2] = 0.0
     drift = np.diag(rng.uniform(0.0, 1e-6, c)) * rng.integers(2)
-    return Estimate(A, y_ref, a, P, size, p + c, is_planar, calibration, estimated, drift)
+    return Estimate(A, y_ref, a, P, size, first, is_planar, calibration, estimated, drift)
 
 
 def random_motion(rng):
@@ -73,7 +74,7 @@ def random_motion(rng):
         np.zeros((4, 4)),
         np.zeros((p, p)),
         np.zeros((p, p)),
-        np.zeros((p, x.first - p)),
+        np.zeros((p, len(x.drift))),
         np.zeros(6),
         np.zeros(6),
     )
@@ -96,7 +97,7 @@ def random_observation(rng):
     points = expected + 0.1 * rng.standard_normal((m, 3)) * (1.0, 1.0, 1.0 - x.is_planar)
     origins = 0.2 * rng.standard_normal((m, 3)) if rng.integers(2) else None
     c_v = len(x.estimated)
-    c_s = x.first - p - c_v
+    c_s = len(x.drift) - c_v
     is_calibrated = bool(rng.integers(2))
     seen = Seen(
         now_ns,

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from slam_observer_ros.association.assignments import find_assignments
-from slam_observer_ros.association.landmark_index import LandmarkIndex
+from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3

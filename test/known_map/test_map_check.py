@@ -83,10 +83,10 @@ def test_what_looks_the_same_is_logged_with_what_would_help(caplog):
     assert not caplog.text
     warn_of_symmetry(hall(turned_by_half()), 'hall')
     assert (
-        'Map hall is the same turned by 180°: without ids or a start pose the robot '
+        'The map hall is the same turned by 180°: without ids or a start pose the robot '
         "can't be found" in caplog.text
     )
-    assert 'one more landmark, at (' in caplog.text
+    assert 'add one more landmark: at (' in caplog.text
 
 
 def test_the_command_says_it_and_draws_it(capsys, tmp_path):

@@ -20,10 +20,10 @@ from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import PLANAR
 from slam_observer_ros.geometry.matrices import diagonal_blocks
-from slam_observer_ros.known_map import export, map_correlations
+from slam_observer_ros.geometry.se3 import rigid_alignment
+from slam_observer_ros.known_map import map_correlations, merging
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
@@ -343,7 +343,7 @@ def test_what_is_loaded_can_be_saved(mode, two_d_mode):
 def test_in_too_large_a_map_only_covariances_are_known_and_the_log_says_so(
     monkeypatch, caplog, is_loaded
 ):
-    monkeypatch.setattr(export, 'MAX_CORRELATED', 5)
+    monkeypatch.setattr(merging, 'MAX_CORRELATED', 5)
     known = a_map(6)
     estimator = Estimator(Settings(reorder_window=0.0, confirmations=1))
     if is_loaded:

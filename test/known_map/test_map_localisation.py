@@ -21,8 +21,8 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map import localiser
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import CONFIRMING_VOTES, is_lost, PoseTrial

@@ -14,14 +14,14 @@ import ros_messages as ros
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.messages import cloud_fields, clouds, poses, velocities
-from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.messages.registry import decoders
-from slam_observer_ros.messages.state_messages import (
+from slam_observer_ros.messages import clouds, poses
+from slam_observer_ros.messages.estimate_messages import (
     encode_transform,
     StateMessages,
     uncertain_pose,
 )
+from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.messages.registry import decoders
 
 FINITE = st.floats(-1e6, 1e6)
 TWISTS = st.tuples(*[FINITE] * 6)
@@ -55,14 +55,14 @@ class TestVelocities:
     @given(TWISTS, ENDIANNESS)
     def test_twist_has_the_time_of_its_reception(self, velocity, little_endian):
         raw = ros.serialise(ros.twist(velocity), little_endian)
-        message = velocities.decode_twist(raw, 42)
+        message = poses.decode_twist(raw, 42)
         assert (message.sensor_frame, message.stamp_ns) == ('', 42)
         np.testing.assert_array_equal(message.body_velocity, velocity)
 
     @given(TWISTS, FRAMES, ENDIANNESS)
     def test_twist_stamped(self, velocity, frame_id, little_endian):
         raw = ros.serialise(ros.twist_stamped(velocity, frame_id), little_endian)
-        message = velocities.decode_twist_stamped(raw, 42)
+        message = poses.decode_twist_stamped(raw, 42)
         assert (message.sensor_frame, message.stamp_ns) == (frame_id, ros.STAMP_NS)
         np.testing.assert_array_equal(message.body_velocity, velocity)
         assert message.covariance is None
@@ -74,7 +74,7 @@ class TestVelocities:
         )
         message_type = 'geometry_msgs/msg/TwistWithCovarianceStamped'
         raw = ros.serialise(ros.make(message_type, ros.header(frame_id), twist), little_endian)
-        message = velocities.decode_twist_with_covariance_stamped(raw, 42)
+        message = poses.decode_twist_with_covariance_stamped(raw, 42)
         np.testing.assert_array_equal(message.body_velocity, velocity)
         np.testing.assert_array_equal(message.covariance, ANGULAR_FIRST_COVARIANCE)
 
@@ -82,39 +82,39 @@ class TestVelocities:
     def test_odometry_twist_is_in_its_child_frame(self, velocity, parent, child, little_endian):
         odometry = ros.odometry(velocity, COVARIANCE, frames=(parent, child))
         raw = ros.serialise(odometry, little_endian)
-        message = velocities.decode_odometry_twist(raw, 42)
+        message = poses.decode_odometry_twist(raw, 42)
         assert (message.sensor_frame, message.stamp_ns) == (child, ros.STAMP_NS)
         np.testing.assert_array_equal(message.body_velocity, velocity)
         np.testing.assert_array_equal(message.covariance, ANGULAR_FIRST_COVARIANCE)
 
     def test_odometry_without_a_pose_still_gives_its_twist(self):
         raw = ros.serialise(ros.odometry([1.0] * 6, COVARIANCE, quaternion=[0.0] * 4))
-        assert velocities.decode_odometry_twist(raw).body_velocity.tolist() == [1.0] * 6
+        assert poses.decode_odometry_twist(raw).body_velocity.tolist() == [1.0] * 6
 
     @pytest.mark.parametrize('first', [0.0, -1.0])
     def test_unknown_covariance_is_none(self, first):
         covariance = np.zeros((6, 6))
         covariance[0, 0] = first
         raw = ros.serialise(ros.odometry([1.0] * 6, covariance))
-        assert velocities.decode_odometry_twist(raw).covariance is None
-        assert velocities.decode_odometry_pose(raw).covariance is None
+        assert poses.decode_odometry_twist(raw).covariance is None
+        assert poses.decode_odometry_pose(raw).covariance is None
 
     def imu(self, covariance: np.ndarray) -> bytes:
         return ros.serialise(ros.imu([1.0, 2.0, 3.0], covariance))
 
     def test_imu_gives_angular_velocity(self):
         covariance = np.arange(1.0, 10.0).reshape(3, 3)
-        message = velocities.decode_imu(self.imu(covariance))
+        message = poses.decode_imu(self.imu(covariance))
         assert (message.stamp_ns, message.sensor_frame) == (ros.STAMP_NS, 'imu')
         assert message.angular_velocity.tolist() == [1.0, 2.0, 3.0]
         np.testing.assert_array_equal(message.covariance, covariance)
-        assert velocities.decode_imu(self.imu(np.zeros((3, 3)))).covariance is None
+        assert poses.decode_imu(self.imu(np.zeros((3, 3)))).covariance is None
 
     def test_imu_without_a_gyroscope_is_refused(self):
         covariance = np.zeros((3, 3))
         covariance[0, 0] = -1.0
         with pytest.raises(MessageError, match='no angular velocity'):
-            velocities.decode_imu(self.imu(covariance))
+            poses.decode_imu(self.imu(covariance))
 
 
 class TestPoses:
@@ -189,12 +189,12 @@ class TestPointCloud:
         assert (message.sensor_frame, message.stamp_ns) == (frame_id, ros.STAMP_NS)
         np.testing.assert_array_equal(message.ids, table[:, 0])
         np.testing.assert_array_equal(message.points, table[:, 1:])
-        assert 'id' in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
+        assert 'id' in clouds.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
 
     def test_without_the_channel_all_ids_are_unknown(self):
         raw = ros.serialise(ros.point_cloud(np.ones((3, 3)), {'intensity': np.ones(3)}))
         assert clouds.decode_point_cloud(raw).ids.tolist() == [-1, -1, -1]
-        assert 'id' not in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
+        assert 'id' not in clouds.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
 
     @pytest.mark.parametrize('bad_id', [0.5, -2.0, np.nan, np.inf, 2.0**24])
     def test_a_point_whose_id_float32_cannot_hold_is_marked_and_the_others_are_taken(self, bad_id):
@@ -252,7 +252,7 @@ class TestPointCloud2:
         assert (message.sensor_frame, message.stamp_ns) == (frame_id, ros.STAMP_NS)
         np.testing.assert_array_equal(message.ids, 7 + np.arange(cloud.size))
         np.testing.assert_array_equal(message.points, points_of(cloud))
-        assert 'id' in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud2').names
+        assert 'id' in clouds.read_fields(raw, 'sensor_msgs/msg/PointCloud2').names
 
     @given(st.integers(0, 5), st.booleans(), st.booleans())
     def test_layout_round_trip(self, count, with_covariances, with_velocities):
@@ -509,7 +509,7 @@ class TestMalformed:
     def test_other_encapsulations_are_refused(self):
         raw = b'\0\x03' + EXAMPLES['geometry_msgs/msg/Twist'][2:]
         with pytest.raises(MessageError, match='not plain CDR'):
-            velocities.decode_twist(raw, 0)
+            poses.decode_twist(raw, 0)
 
     def test_huge_sequence_length_allocates_nothing(self):
         raw = bytearray(ros.serialise(ros.point_cloud(np.zeros((0, 3)), {}, '')))
@@ -592,7 +592,7 @@ def test_rclpy_serialises_the_same_bytes():
         raw = ros.serialise(recorded)
         assert serialization.deserialize_message(raw, type(message)) == message
     published = [serialization.serialize_message(message) for message in messages_of_rclpy]
-    decoded = velocities.decode_twist_stamped(published[-3])
+    decoded = poses.decode_twist_stamped(published[-3])
     assert (decoded.sensor_frame, decoded.stamp_ns) == ('base_link', ros.STAMP_NS)
     assert decoded.body_velocity.tolist() == [0.0, 0.0, -0.5, 1.5, 0.0, 0.0]
     event = clouds.decode_point_cloud2(published[-2])

@@ -17,8 +17,8 @@ import ros_messages as ros
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent, VelocityBlock, VelocityEvent
 from slam_observer_ros.messages.cdr import CdrReader, encode_string
+from slam_observer_ros.messages.poses import decode_twist_stamped
 from slam_observer_ros.messages.registry import decoders, reads
-from slam_observer_ros.messages.velocities import decode_twist_stamped
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings import message_types

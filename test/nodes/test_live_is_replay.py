@@ -20,8 +20,11 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
-from slam_observer_ros.messages.estimate_messages import EstimateMessages
-from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
+from slam_observer_ros.messages.estimate_messages import (
+    EstimateMessages,
+    StateMessages,
+    uncertain_pose,
+)
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames

@@ -32,7 +32,7 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
-from slam_observer_ros.messages.velocities import decode_twist, ODOMETRY
+from slam_observer_ros.messages.poses import decode_twist, ODOMETRY
 from slam_observer_ros.nodes.intake import warning_decoders
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info

@@ -27,8 +27,8 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import diagonal_blocks
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.messages.estimate_messages import StateMessages, uncertain_pose
 from slam_observer_ros.messages.poses import pose_matrices
-from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener

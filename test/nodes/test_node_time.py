@@ -21,7 +21,7 @@ from robots import own_topics, Robot, stamp_ns, TransformSender
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam_observer_ros.recording.arrivals import Arrivals, MOST_SAMPLES
+from slam_observer_ros.recording.contents import Arrivals, MOST_SAMPLES
 
 SECOND = 10**9
 

@@ -15,13 +15,12 @@ import pytest
 
 from slam_observer_ros.common.errors import DataSetError, RecordingError
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.recording.datasets.data_set import DataSet
-from slam_observer_ros.recording.datasets.graph import load_graph
-from slam_observer_ros.recording.datasets.mrclam import load_mrclam
-from slam_observer_ros.recording.datasets.starry_night import load_starry_night
+from slam_observer_ros.recording.graph_files import load_graph
+from slam_observer_ros.recording.mrclam import load_mrclam
 from slam_observer_ros.recording.opening import MAX_METADATA_BYTES
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recording.starry_night import load_starry_night
+from slam_observer_ros.recording.writer import DataSet, RecordingWriter
 
 GRAPH = """\
 EDGE2 0 1 1 1 1.5707963267948966 10 0 0 10 0 100

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from recordings import events, MESSAGE_COUNT, write_mcap
 
-from slam_observer_ros.common.version import VERSION
-from slam_observer_ros.evaluation.ellipses import ellipses
+from slam_observer_ros import __version__
+from slam_observer_ros.evaluation.consistency import ellipses
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.error_health import growth_windows
@@ -94,7 +94,7 @@ def test_json_says_what_was_replayed_and_how(slam_observer, tmp_path):
     assert figures['recording'] == str(recording)
     assert figures['recording_sha256'] == hashlib.sha256(recording.read_bytes()).hexdigest()
     assert figures['settings'] == {'range_noise': 0.2}
-    assert (figures['version'], figures['warnings']) == (VERSION, [])
+    assert (figures['version'], figures['warnings']) == (__version__, [])
     assert figures['nis'] >= 0.0
 
 

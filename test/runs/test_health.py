@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 import json
+from pathlib import Path
 import re
 import string
 
@@ -11,6 +12,7 @@ from command_line import CommandLine
 import pytest
 from recordings import events
 
+import slam_observer_ros
 from slam_observer_ros.common.findings import found, KINDS, Level
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
@@ -105,3 +107,10 @@ def test_log_json_report_and_recorded_diagnostics_say_the_same(wild, tmp_path, c
         assert text in ended.json['warnings']
         assert f'warning: {text}' in ended.errors
         assert text not in numbers['warnings']
+
+
+@pytest.mark.parametrize('folder', ['recording', 'inputs', 'messages'])
+def test_what_inputs_complain_of_is_a_finding(folder):
+    for path in (Path(slam_observer_ros.__file__).parent / folder).glob('*.py'):
+        said = re.findall(r'logger\.warning\((.*)', path.read_text(encoding='utf-8'))
+        assert all(re.match("'%s', (found\\(|finding\\))", words) for words in said), path

@@ -10,7 +10,7 @@ from gain_worlds import drive
 import numpy as np
 import pytest
 
-from slam_observer_ros.common.columns import LandmarkColumns
+from slam_observer_ros.common.types import LandmarkColumns
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize

@@ -11,9 +11,8 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.messages.clouds import CLOUDS
-from slam_observer_ros.messages.poses import TRANSFORMS
+from slam_observer_ros.messages.poses import decode_odometry_pose, ODOMETRY, TRANSFORMS
 from slam_observer_ros.messages.registry import decoders
-from slam_observer_ros.messages.velocities import decode_odometry_pose, ODOMETRY
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.intake.warning_decoders import (

@@ -8,7 +8,7 @@ from statistics import median_low
 import time
 from typing import TypeAlias
 
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import to_s
 
 SAMPLES = 11
 """Messages whose median offset is looked at: five stragglers in a row change nothing."""

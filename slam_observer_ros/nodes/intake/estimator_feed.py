@@ -11,7 +11,7 @@ import time
 from rclpy.node import Node
 
 from slam_observer_ros.common.errors import TransformError
-from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,

@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.intake.load import Backlog, LoadShedding, Waiting

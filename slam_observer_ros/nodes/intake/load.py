@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from slam_observer_ros.common.units import to_s
+from slam_observer_ros.common.stamps import to_s
 
 BEHIND_S = 0.3  # messages that wait for less, as while a map is loaded, are no matter
 LASTING_S = 2.0  # how long messages have to wait for more than that before it is reported

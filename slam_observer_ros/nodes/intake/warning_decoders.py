@@ -9,13 +9,12 @@ from rclpy.node import Node
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.inputs.odometry_check import OdometryCheck
+from slam_observer_ros.inputs.odometry import OdometryCheck
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
+from slam_observer_ros.messages.clouds import ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
-from slam_observer_ros.messages.poses import decode_transforms, PoseMessage
+from slam_observer_ros.messages.poses import decode_odometry, decode_transforms, PoseMessage
 from slam_observer_ros.messages.registry import Decode, decoders
-from slam_observer_ros.messages.velocities import decode_odometry
 
 MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero
 WITHOUT_TAG_S = 20.0  # time without any fiducial on /tf after which their names may be others

@@ -13,15 +13,18 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from std_msgs.msg import Float64
 from visualization_msgs.msg import MarkerArray
 
-from slam_observer_ros.common.clock_jumps import is_due
+from slam_observer_ros.common.stamps import is_due, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
-from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
-from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
+from slam_observer_ros.messages.clouds import FLOAT32_ID_LIMIT
+from slam_observer_ros.messages.estimate_messages import (
+    EstimateMessages,
+    PATH_SPACING_NS,
+    StateMessages,
+    uncertain_pose,
+)
 from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
 from slam_observer_ros.nodes.intake.input_topic import rivals
 from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import (

@@ -7,8 +7,8 @@ from rclpy.node import Node
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3

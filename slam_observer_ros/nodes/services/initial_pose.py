@@ -9,8 +9,8 @@ import numpy as np
 from rclpy.node import Node
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
 from slam_observer_ros.geometry.matrices import are_covariances, limited
 from slam_observer_ros.messages.poses import (

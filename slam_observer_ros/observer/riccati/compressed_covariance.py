@@ -2,7 +2,8 @@
 
 P is that of pose, calibration and the landmarks that are *active*: near, or seen of late. Motions
 and observations change P alone, and what they yet have to do to all others is postponed
-(:mod:`.postponed_correction`) until other landmarks become active. It is exact but for one thing:
+(:mod:`.postponed_correction`) until other landmarks become active: it is gathered in columns of P
+that nothing else acts on. It is exact but for one thing:
 what the noise of a motion does to the error ξ_i of a landmark out of view is judged by a reference
 position, which is set again when the estimate is too far off (J. Guivant and E. Nebot,
 *Optimization of the SLAM algorithm for real-time implementation*, 2001). As long as there are few
@@ -16,8 +17,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose
@@ -28,7 +27,6 @@ from slam_observer_ros.observer.riccati.following_landmarks import FollowingLand
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
-from slam_observer_ros.sensor_models.motion import Motion
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -56,11 +54,11 @@ class CompressedCovariance(JointCovariance):
     def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
         vars(self).update(vars(dense))
         self._form, self._observer, self._size = copy(dense), observer, size
-        self._form._matrix = SymmetricMatrix(self.P[: self.first, : self.first])
+        self._form._matrix = SymmetricMatrix(self.of_robot)
         n = len(observer.y_ref)
         self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
         self._set_active(np.arange(n), n)
-        self._following = FollowingLandmarks(self.chart, observer, self.P)
+        self._following = FollowingLandmarks(self.chart, observer)
         self._corrections, self._most = 0, size.most
         observer.postponed = self
 
@@ -89,30 +87,18 @@ class CompressedCovariance(JointCovariance):
 
     # The step
 
-    def _project(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return H P beside H Φ (r, …) and H P Hᵀ (r, r)."""
-        HP, HPH = super()._project(C, columns)
-        Phi = self._postponed.Phi
-        return np.hstack([HP, C @ Phi[: C.shape[1]] - Phi[columns]]), HPH
-
-    def project_own_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of ω_i."""
-        HP, HPH = super().project_own_turns(rows)
-        return np.hstack([HP, self._postponed.Phi[self._turn_columns(rows)]]), HPH
-
     def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
         """Update P by what has been projected; return K r of pose, calibration, active ones."""
-        if not len(r):
-            return np.zeros(len(self.P))
-        # L⁻¹ of all that is multiplied by S⁻¹ = L⁻ᵀ L⁻¹.
-        whitened = _whitened(S, np.column_stack([HP, r]))
-        W, W_Phi, z = np.split(whitened, [len(self.P), whitened.shape[1] - 1], axis=1)
-        self._matrix.subtract_square(W)
-        Kr: FloatArray = W.T @ z[:, 0]
-        turn = self._axes.full_pose(-Kr[: self._p])[:3]
-        self._postponed.correct(W, W_Phi, z[:, 0], turn)
-        self._following.work()
+        Kr = super().update(HP, S, r)
+        if len(r):
+            self.follow(-Kr)
         return Kr
+
+    def follow(self, x: FloatArray) -> None:
+        """Let others follow as the state is moved by exp(x), of which the first entries count."""
+        turn = self._axes.full_pose(x[: self._p])[:3]
+        self._postponed.move(turn, x[self._entries])
+        self._following.work()
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks ``rows`` (m,), of an observation, are active."""
@@ -135,14 +121,6 @@ class CompressedCovariance(JointCovariance):
             shifts[view.rows] = view.shifts
         chosen: FloatArray = shifts[rows]
         return chosen
-
-    def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
-        super()._propagate(motion, J_landmarks)
-        if self._p < self.first:
-            Phi = self._postponed.Phi
-            growth = motion.sensitivity @ Phi[self._p : self.first]
-            Phi[: self._p] += growth
-            Phi[self.first :] += J_landmarks @ growth
 
     # Landmarks
 
@@ -206,7 +184,8 @@ class CompressedCovariance(JointCovariance):
         is_active, q = self._places[rows] >= 0, self.chart.turn
         covariances = np.empty((len(rows), q, q))
         covariances[is_active] = super().own_turns(rows[is_active])
-        covariances[~is_active] = self._following.own_turns(rows[~is_active])
+        taken_back = self.P[self._entries, self._entries]
+        covariances[~is_active] = self._following.own_turns(rows[~is_active], taken_back)
         return covariances
 
     def of_landmarks(
@@ -231,7 +210,6 @@ class CompressedCovariance(JointCovariance):
         places, slots = self._places[rows], self._following.slots[rows]
         columns = self.chart.of_landmarks(places[places >= 0])
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
-        self._postponed.remove(columns)
         self._outside.remove(slots[slots >= 0])
         kept = np.ones(len(self._places), dtype=np.bool_)
         kept[rows] = False
@@ -253,18 +231,18 @@ class CompressedCovariance(JointCovariance):
         """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
         self._apply()
         P = super().of_positions(points[self.active])
+        P = P[np.ix_(self._x, self._x)]
         # Errors of all others are those of their positions now, too.
         p = self._p
         T = self._all_turning(points[self.active])
         for panel in self._outside.panels:
             X = panel.X.copy()
-            X[:, self.first :] -= X[:, :p] @ T.T
+            X[:, self.chart.robot :] -= X[:, :p] @ T.T
             X[:, :p] = 0.0
             panel.X = X
         P[:p] = P[:, :p] = 0.0
         P[:p, :p] = covariance
-        self.P = sheared(P, self.first, T)
-        self._following.start(self.P)
+        self._start(sheared(P, self.chart.robot, T))
 
     def marginal(self, rows: IntArray) -> JointCovariance:
         """Return the covariance of pose, calibration and different landmarks (m,) alone."""
@@ -272,19 +250,18 @@ class CompressedCovariance(JointCovariance):
         others = np.flatnonzero(~is_active)
         others = others[np.argsort(self._following.slots[rows[others]])]
         local = np.append(
-            np.arange(self.first), self.chart.of_landmarks(self._places[rows[is_active]])
+            np.arange(self.chart.robot), self.chart.of_landmarks(self._places[rows[is_active]])
         )
-        following, postponed = self._following, self._postponed
-        views = following.views(rows[others])
-        X, B, references = following.joined(rows[others], views)
-        own = B - X @ postponed.Psi @ X.T
-        to_local = X @ postponed.Phi[local].T
+        following = self._following
+        X, B, references = following.joined(rows[others], following.views(rows[others]))
+        to_x = X @ self.P[self._entries]
+        to_local, own = to_x[:, local], B + to_x[:, self._entries] @ X.T
         P = np.block([[self.P[np.ix_(local, local)], to_local.T], [to_local, own]])
         # From η to ξ, and in the order of the rows.
         P = sheared(P, len(local), self._all_turning(references))
         order = np.argsort(np.append(np.flatnonzero(is_active), others))
         joint = copy(self._form)
-        columns = np.append(np.arange(self.first), self.chart.of_landmarks(order))
+        columns = np.append(np.arange(self.chart.robot), joint.chart.of_landmarks(order))
         joint._matrix = SymmetricMatrix(P[np.ix_(columns, columns)])
         return joint
 
@@ -333,46 +310,80 @@ class CompressedCovariance(JointCovariance):
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]
         own = symmetric(to_x[:, columns] - to_x[:, :p] @ T.T)
-        kept = np.delete(np.arange(len(P)), columns)
+        is_kept = np.ones(len(P), dtype=np.bool_)
+        is_kept[columns] = False
+        kept = np.flatnonzero(is_kept[self._x])
         slots = all_slots[released]
         change = Change(
             self._postponed,
-            self._postponed.root(),
+            P[self._x, self._entries],
+            self._postponed.root(-P[self._entries, self._entries]),
             outside.taken,
-            P[: angles if self._postponed.has_moved else 0].copy(),
+            P[: angles if self._postponed.has_moved else 0, self._x],
             kept,
             slots,
             points,
             outside.rows(slots),
-            columns,
+            columns - outside.width,
             T,
             own,
-            to_x[:, kept],
+            to_x[:, self._x[kept]],
         )
         outside.begin(change)
-        self.P = P[np.ix_(kept, kept)]
         self._set_active(self.active[~np.isin(self.active, released)], len(self._places))
         self._following.set_slots(all_slots, self._others)
-        self._following.start(self.P)
+        self._start(P[np.ix_(self._x[kept], self._x[kept])])
 
     def _take_in(self, rows: IntArray) -> None:
         """Make landmarks (m,) active, too."""
         if not len(rows):
             return
-        following, postponed, P, p = self._following, self._postponed, self.P, self._p
+        following, P, p, first = self._following, self.P, self._p, self.first
         rows = rows[np.argsort(following.slots[rows])]
         X, among, references = following.catch_up(rows)
-        XPsi = X @ postponed.Psi
         # ξ = η + T ε with x and with each other.
         T = self._all_turning(references)
-        eta_to_x = X @ postponed.Phi.T
+        eta_to_x = X @ P[self._entries]
         to_x = eta_to_x + T @ P[:p]
-        own = among - XPsi @ X.T + eta_to_x[:, :p] @ T.T + T @ to_x[:, :p].T
-        postponed.take(T @ postponed.Phi[:p] - XPsi, np.diagonal(among))
-        self.P = np.block([[P, to_x.T], [to_x, symmetric(own)]])
+        own = among + eta_to_x[:, self._entries] @ X.T + eta_to_x[:, :p] @ T.T + T @ to_x[:, :p].T
+        # X gets columns, of η itself.
+        m, size = len(own), len(P)
+        old = np.append(np.arange(first), np.arange(first, size) + m)
+        taken, new = first + np.arange(m), size + m + np.arange(m)
+        M = np.zeros((size + 2 * m,) * 2)
+        M[np.ix_(old, old)] = P
+        M[np.ix_(new, old)], M[np.ix_(old, new)] = to_x, to_x.T
+        M[np.ix_(new, new)] = symmetric(own)
+        M[new, taken] = M[taken, new] = 1.0
+        self._use(self.chart.with_postponed(first - self.chart.robot + m))
+        self.P = M
+        self._postponed.take(np.diagonal(among))
         self._set_active(np.append(self.active, rows), len(self._places))
         following.set_slots(following.slots, self._others)
         following.outside.take(following.slots[rows])
+
+    @property
+    def _x(self) -> IntArray:
+        """Which entries of P are those of x."""
+        return np.append(np.arange(self.chart.robot), np.arange(self.first, len(self.P)))
+
+    @property
+    def _entries(self) -> slice:
+        """Those of what is postponed."""
+        return slice(self.chart.robot, self.first)
+
+    def _start(self, P: FloatArray) -> None:
+        """Let x have the covariance P from now on, and postpone what it has to do to others."""
+        size, count = len(P), self._outside.size
+        self._use(self.chart.with_postponed(count))
+        x = np.arange(size)
+        x[self.chart.robot :] += count
+        M = np.zeros((size + count,) * 2)
+        M[np.ix_(x, x)] = P
+        entries = self.chart.robot + np.arange(count)
+        M[x[:count], entries] = M[entries, x[:count]] = 1.0
+        self.P = M
+        self._following.start(np.diagonal(P)[:count])
 
     def _set_active(self, rows: IntArray, n: int) -> None:
         self.active, self._places = rows, np.full(n, -1)
@@ -380,16 +391,12 @@ class CompressedCovariance(JointCovariance):
 
     def _of_others(self, rows: IntArray, q: int) -> tuple[FloatArray, FloatArray]:
         """Return covariances with q first entries of x (m, k, q), own (m, k, k) of ξ_i outside."""
-        X, own, references = self._following.each(rows)
+        X, own, references = self._following.each(rows, self.P[self._entries, self._entries])
         T, p = self._turning(references), self._p
-        to_state = X @ self._postponed.Phi[:q].T
+        to_state = X @ self.P[self._entries, :q]
         turned = T @ transpose(to_state[:, :, :p])
         own = own + turned + transpose(turned) + T @ self.pose @ transpose(T)
         return to_state + T @ self.P[:p, :q], own
-
-    def _set(self, columns: IntArray, C: FloatArray, noise: FloatArray) -> None:
-        super()._set(columns, C, noise)
-        self._postponed.Phi[columns] = C @ self._postponed.Phi[: C.shape[1]]
 
     def _make_room(self, m: int) -> IntArray:
         """Append rows and columns for m landmarks; return which landmarks they are."""
@@ -397,7 +404,6 @@ class CompressedCovariance(JointCovariance):
         new = len(self._places) + np.arange(m)
         self._set_active(np.append(self.active, new), len(self._places) + m)
         self._following.slots = np.append(self._following.slots, np.full(m, -1))
-        self._postponed.extend(self._stride * m)
         return new
 
     def _known_blocks(self, covariances: FloatArray) -> FloatArray:
@@ -412,14 +418,3 @@ class CompressedCovariance(JointCovariance):
 
     def _turn_columns(self, rows: IntArray) -> IntArray:
         return super()._turn_columns(self._places[rows])
-
-
-def _whitened(S: FloatArray, right: FloatArray) -> FloatArray:
-    """Return L⁻¹ b for b (m, …) and S = L Lᵀ (m, m); without the null space of a singular S."""
-    L, is_indefinite = dpotrf(S, lower=1)
-    if is_indefinite:  # by rounding, where all but nothing was known
-        variances, V = np.linalg.eigh(S)
-        known = variances > np.finfo(np.float64).eps * variances[-1]
-        whitened: FloatArray = (V[:, known] / np.sqrt(variances[known])).T @ right
-        return whitened
-    return np.asarray(dtrsm(1.0, L, right, lower=1))

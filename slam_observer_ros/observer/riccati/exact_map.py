@@ -18,8 +18,8 @@ class ExactMapCovariance(JointCovariance):
     is_dense = False
 
     def __init__(self, joint: JointCovariance, covariances: FloatArray) -> None:
-        first = joint.first
-        super().__init__(joint.chart, joint._matrix, joint.P[:first, :first], joint._unknown)
+        chart = joint.chart.with_postponed(0)
+        super().__init__(chart, joint._matrix, joint.of_robot, joint._unknown)
         self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:

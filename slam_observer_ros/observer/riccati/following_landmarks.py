@@ -34,14 +34,14 @@ FOLDING = 3e7
 class FollowingLandmarks:
     """The landmarks of an observer that are not in P, and what has yet to be done to them."""
 
-    def __init__(self, chart: Chart, observer: Observer, P: FloatArray) -> None:
+    def __init__(self, chart: Chart, observer: Observer) -> None:
         self._axes, self._stride, self._has_turns = chart.axes, chart.stride, chart.turn > 0
         self._observer = observer
-        self.outside = OutsideLandmarks(chart, len(P))
+        self.outside = OutsideLandmarks(chart)
         # (n,) where each landmark is outside, −1 for nowhere; and (slots,) which ones are there
         self.slots: IntArray = np.full(len(observer.y_ref), -1)
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
-        self.start(P)
+        self.start(np.empty(0))
         self._changed = 0  # panels, since the last correction
 
     def copy(self, observer: Observer) -> FollowingLandmarks:
@@ -51,9 +51,9 @@ class FollowingLandmarks:
         other.outside, other.postponed = self.outside.copy(), self.postponed.copy()
         return other
 
-    def start(self, P: FloatArray) -> None:
-        """Postpone from now on what corrections of x, of covariance P, have to do to them."""
-        self.postponed = PostponedCorrection(P, self._axes.point, self._has_turns)
+    def start(self, variances: FloatArray) -> None:
+        """Postpone from now on what corrections of x, of ``variances``, have to do to them."""
+        self.postponed = PostponedCorrection(variances, self._axes.point, self._has_turns)
 
     # Slots
 
@@ -103,28 +103,31 @@ class FollowingLandmarks:
         self, rows: IntArray, views: list[View]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return X (m k, …), B (m k, m k) and references (m, 3) of landmarks in slot order."""
-        b = self.postponed.Phi.shape[1]
-        X = np.concatenate([np.empty((0, b)), *(view.X.reshape(-1, b) for view in views)])
+        b = self.outside.width
+        blocks = [np.empty((0, self._stride, b)), *(view.X for view in views)]
+        X = np.concatenate(blocks).reshape(self._stride * len(rows), b)
         references = np.concatenate([np.empty((0, 3)), *(view.references for view in views)])
         return X, self.outside.among(self.slots[rows], views), references
 
-    def each(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def each(
+        self, rows: IntArray, minus_Psi: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return X (m, k, …), the covariance (m, k, k) and reference (m, 3) of each position."""
         order = np.argsort(np.argsort(self.slots[rows]))
         k, views = self._axes.point, self.views(rows)
         X = np.concatenate([view.X for view in views])[order, :k]
         references = np.concatenate([view.references for view in views])[order]
         own = np.concatenate([view.own for view in views])[order, :k, :k]
-        return X, own - (X @ self.postponed.Psi) @ transpose(X), references
+        return X, own + (X @ minus_Psi) @ transpose(X), references
 
-    def own_turns(self, rows: IntArray) -> FloatArray:
+    def own_turns(self, rows: IntArray, minus_Psi: FloatArray) -> FloatArray:
         """Return the covariances (m, q, q) of each ω_i, rad²."""
         k, q = self._axes.point, self._stride - self._axes.point
         order = np.argsort(np.argsort(self.slots[rows]))
         covariances = [np.empty((0, q, q))]
         for view in self.views(rows):
             X = view.X[:, k:]
-            covariances.append(view.own[:, k:, k:] - (X @ self.postponed.Psi) @ transpose(X))
+            covariances.append(view.own[:, k:, k:] + (X @ minus_Psi) @ transpose(X))
         return np.concatenate(covariances)[order]
 
     def _points(self, rows: IntArray) -> FloatArray:

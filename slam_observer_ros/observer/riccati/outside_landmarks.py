@@ -25,7 +25,8 @@ class Change:
     """What has yet to be done to all landmarks as x started again: (q,) entries, then fewer."""
 
     postponed: PostponedCorrection  # until then
-    root: FloatArray  # (q₀, r) of its Ψ
+    Phi: FloatArray  # (q, q₀)
+    root: FloatArray  # (q₀, r) of Ψ
     taken: IntArray  # slots that are the last columns of X until then
     turns: FloatArray  # (s, q) covariance of the angles of ε with x
     kept: IntArray  # entries of x that stay
@@ -85,11 +86,11 @@ class OutsideLandmarks:
     landmarks that have been taken in since.
     """
 
-    def __init__(self, chart: Chart, size: int) -> None:
+    def __init__(self, chart: Chart) -> None:
         self._chart, self._axes, self._stride = chart, chart.axes, chart.stride
         self.matrix = PanelMatrix()  # B
         self.panels: list[Panel] = []
-        self.size = size  # q₀
+        self.size = 0  # q₀
         self.taken: IntArray = np.empty(0, dtype=np.int64)  # (t,) slots
         self.unchanged: dict[int, Change] = {}  # panels to which one has yet to happen
         self._unused: list[int] = []
@@ -108,6 +109,11 @@ class OutsideLandmarks:
         """How many slots a panel has."""
         return PANEL_ROWS // self._stride
 
+    @property
+    def width(self) -> int:
+        """How many columns X has, with those that some panels do not have yet."""
+        return self.size + self._stride * len(self.taken)
+
     def rows(self, slots: IntArray) -> IntArray:
         """Return where landmarks are in B (m k,)."""
         return self._rows(slots).ravel()
@@ -123,8 +129,7 @@ class OutsideLandmarks:
         each, k = self.slots_each, self._stride
         while len(self._unused) < count:
             self._unused += range(each * len(self.panels), each * (len(self.panels) + 1))
-            width = self.size + k * len(self.taken)
-            X, own = np.zeros((PANEL_ROWS, width)), np.zeros((each, k, k))
+            X, own = np.zeros((PANEL_ROWS, self.width)), np.zeros((each, k, k))
             self.panels.append(Panel(X, own, np.zeros((each, 3))))
             self.matrix.append()
         slots, self._unused = self._unused[:count], self._unused[count:]
@@ -222,7 +227,8 @@ class OutsideLandmarks:
     def begin(self, change: Change) -> None:
         """Begin a change of all landmarks; there may be no other one yet."""
         self.unchanged = dict.fromkeys(range(len(self.panels)), change)
-        self.taken, self.size = np.empty(0, dtype=np.int64), len(change.kept)
+        self.taken = np.empty(0, dtype=np.int64)
+        self.size = len(change.kept) if self.panels else 0  # where nothing is, nothing has to be
         self.matrix.begin(change.weights)
         if not self.panels:
             self.matrix.end()
@@ -237,9 +243,9 @@ class OutsideLandmarks:
         new = change.slots[at] % self.slots_each  # landmarks that were in x
         were_out = are_out.copy()
         were_out[new] = False
-        size = change.postponed.Phi.shape[1] - self._stride * len(change.taken)
+        size = change.Phi.shape[1] - self._stride * len(change.taken)
         before = self._completed(number, size, change.taken, were_out)
-        X = before @ change.postponed.Phi.T
+        X = before @ change.Phi.T
         # Where the estimate has moved to, the reference follows, …
         was_off = np.where(were_out[:, None], points - panel.references, 0.0)
         off, each = was_off.copy(), before.reshape(len(points), self._stride, -1)

@@ -1,1 +1,0 @@
-"""``slam-observer batch``: many recordings with many settings."""

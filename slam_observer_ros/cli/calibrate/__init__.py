@@ -1,1 +1,0 @@
-"""``slam-observer calibrate``: how sensor and odometry err, by a recording of a drive."""

@@ -1,1 +1,0 @@
-"""``slam-observer replay``."""

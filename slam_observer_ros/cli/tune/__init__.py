@@ -1,1 +1,0 @@
-"""``slam-observer tune``: noise figures by maximum likelihood of the innovations."""

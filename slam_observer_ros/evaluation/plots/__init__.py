@@ -1,1 +1,0 @@
-"""Figures, as PNG, SVG or PDF; an EvaluationError is raised if one can't be written."""
