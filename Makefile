@@ -40,17 +40,18 @@ test: lint pytest colcon  ## everything that a change must pass
 lint: $(READY_TO_DEVELOP)  ## ruff, mypy --strict, the layers of the architecture
 	$(VENV)/bin/ruff check --no-cache
 	$(VENV)/bin/ruff format --no-cache --check
-	$(VENV)/bin/mypy --cache-dir /dev/null
+	$(VENV)/bin/mypy --cache-dir $(VENV)/mypy-cache
 	$(VENV)/bin/lint-imports --no-cache
 
 format: $(READY_TO_DEVELOP)  ## let ruff mend style and layout
 	$(VENV)/bin/ruff check --no-cache --fix
 	$(VENV)/bin/ruff format --no-cache
 
-# The tests of one file share nodes and a ROS domain; those of two have nothing in common.
+# The tests of one file share nodes and a ROS domain; those of two have nothing in common, and come
+# in the order of test/conftest.py. Tests that wait for nodes leave cores to others.
 pytest: $(READY_TO_DEVELOP) $(CORE)  ## the tests alone
 	scripts/ensure_chromium.sh
-	$(PYTHON_IN_VENV) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+	$(PYTHON_IN_VENV) -m pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 
 colcon: $(READY_TO_DEVELOP)  ## build, install and test as a ROS workspace does
 	scripts/colcon_check.sh $(VENV)

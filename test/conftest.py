@@ -59,6 +59,37 @@ settings.register_profile('suite', derandomize=True, deadline=None, max_examples
 settings.load_profile('suite')
 
 
+LONGEST = (
+    'test_cli_replay',
+    'test_large_maps',
+    'test_batch',
+    'test_association',
+    'test_batch_cluster',
+    'test_map_replay',
+    'test_report',
+    'test_live_settings',
+    'test_map_localisation',
+    'test_scheduled',
+)
+"""Files that take longest, of those without nodes: they begin early, so that none ends alone."""
+
+WAITING_SHARE = 0.8
+"""Part of a session within which all files with nodes begin."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Spread the files that start nodes, which mostly wait, among those that compute."""
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    waiting = [f for f in files if any(item.get_closest_marker('ros') for item in files[f])]
+    computing = [path for path in files if path not in waiting]
+    computing.sort(key=lambda path: LONGEST.index(path.stem) if path.stem in LONGEST else 99)
+    places = {path: WAITING_SHARE * n / len(waiting) for n, path in enumerate(waiting)}
+    places |= {path: n / len(computing) for n, path in enumerate(computing)}
+    items[:] = [item for path in sorted(files, key=places.__getitem__) for item in files[path]]
+
+
 @pytest.fixture(scope='session')
 def data_dir() -> Path:
     """Folder of the public recordings; tests that need it are skipped where there is none."""

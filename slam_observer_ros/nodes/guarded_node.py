@@ -125,6 +125,11 @@ def _refusal(request: Any, response: Any, text: str) -> Any:
     return response
 
 
+def _do_nothing(*arguments: Any) -> Any:
+    """Take the place of a callback whose timer, topic or service has been removed."""
+    return arguments[-1] if arguments else None  # a service's response, which nobody hears
+
+
 class Entities:
     """Remembers the publishers, subscriptions, services, timers and callbacks a node has now.
 
@@ -137,9 +142,14 @@ class Entities:
         self._known = self._present()
 
     def remove_new(self) -> None:
-        """Destroy what the node has got since."""
+        """Destroy what the node has got since; nothing of it is called any more.
+
+        An executor may have heard already that something is due, and calls it all the same.
+        """
         for remove, entities in self._present().items():
             for entity in entities - self._known[remove]:
+                if hasattr(entity, 'callback'):
+                    entity.callback = _do_nothing
                 getattr(self._node, remove)(entity)
 
     def _present(self) -> dict[str, set[Any]]:

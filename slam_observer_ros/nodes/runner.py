@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 import os
 import sys
 import threading
 
 import rclpy
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import (
+    InvalidHandle,
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+)
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -94,7 +99,7 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     executor.add_node(node)
     try:
         while not stop.is_set and rclpy.ok():
-            executor.spin_once(timeout_sec=STOP_LATENCY_S)
+            turn(executor)
     except ExternalShutdownException:
         node.get_logger().debug('context was shut down')
     finally:
@@ -102,6 +107,13 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
         exit_code = _destroy(node)
         has_ended.set()
     return exit_code
+
+
+def turn(executor: Executor) -> None:
+    """Let an executor do what is due, or wait for a moment."""
+    # rclpy's other executors pass over a service that was removed while it was called.
+    with suppress(InvalidHandle):
+        executor.spin_once(timeout_sec=STOP_LATENCY_S)
 
 
 def _reason(error: Exception) -> str:

@@ -353,9 +353,20 @@ def test_without_ids_real_robots_are_hardly_worse_off(data_dir):
     """Commands as odometry, blind for a minute at a time, posts of two or three barcodes."""
     ratios = []
     for robot in (2, 3):
-        run = load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot)
+        run = first_half(load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot))
         ratios.append(_configuration_rmse_m(run, nameless) / _configuration_rmse_m(run))
     assert np.mean(ratios) < 1.3
+
+
+def first_half(run):
+    velocities = len(run.velocity_stamps_ns) // 2
+    end_ns = run.velocity_stamps_ns[velocities]
+    return replace(
+        run,
+        velocity_stamps_ns=run.velocity_stamps_ns[:velocities],
+        body_velocities=run.body_velocities[:velocities],
+        observations=[event for event in run.observations if event.stamp_ns < end_ns],
+    )
 
 
 def _configuration_rmse_m(run, change=None):

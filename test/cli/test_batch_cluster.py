@@ -12,6 +12,7 @@ import time
 from command_line import CommandLine
 import pytest
 
+from slam_observer_ros.cli import batch_pool
 from slam_observer_ros.cli.batch_jobs import read_logs
 
 pytest.importorskip('distributed', reason="no Dask is installed (pip's extra 'cluster')")
@@ -125,7 +126,8 @@ def test_a_scheduler_that_can_not_be_is_an_error_in_one_line(tmp_path):
     assert all('no Dask scheduler answers there' in line for line in lines)
 
 
-def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(capsys, tmp_path):
+def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(batch_pool, 'CONNECT_S', 1.0)
     options = ('batch', SAMPLE, '--out', tmp_path / 'r', '--scheduler', 'tcp://127.0.0.1:9')
     assert 'no Dask scheduler answers there' in CommandLine(capsys).fail(*options)
     assert not list(tmp_path.iterdir())

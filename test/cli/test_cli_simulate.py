@@ -27,7 +27,7 @@ def test_by_default_log_lyapunov_falls_at_the_rate_of_the_paper(slam_observer):
     assert result['log10_lyapunov'][-1] < -14.0
 
 
-@pytest.mark.parametrize(('step_s', 'duration_s'), [(0.001, 4.0), (0.2, 80.0), (2.0, 80.0)])
+@pytest.mark.parametrize(('step_s', 'duration_s'), [(0.002, 4.0), (0.2, 80.0), (2.0, 80.0)])
 def test_the_rate_does_not_depend_on_the_step(slam_observer, step_s, duration_s):
     result = slam_observer.succeed(
         'simulate', '--json', '--step', step_s, '--duration', duration_s

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
 NUMBERS = [row for row in ROWS if not isinstance(row.default, bool | str)]
 
 
-@hypothesis_settings(max_examples=10, deadline=None)
+@hypothesis_settings(max_examples=10)
 @given(generators(), st.sampled_from([0.0, 0.1, 0.5]))
 def test_whatever_comes_and_is_set_the_estimate_stays_one(rng, share):
     """Blocks, flipped and unset orientations, maps with correlations, live settings, nonsense."""

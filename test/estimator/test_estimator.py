@@ -138,7 +138,7 @@ def test_seen_again_a_landmark_corrects_the_drift_of_the_velocity():
     assert error < 0.25 * np.linalg.norm(drifted.pose[:3, 3] - true_pose(9.95)[:3, 3])
 
 
-@hypothesis_settings(max_examples=20, deadline=None)
+@hypothesis_settings(max_examples=20)
 @given(st.randoms(use_true_random=False))
 def test_events_shuffled_within_the_window_give_the_same_bits(random):
     events = drive()

@@ -156,7 +156,7 @@ def assert_same_samples(one, other):
         },
     ),
 )
-@hypothesis_settings(max_examples=20, deadline=None)
+@hypothesis_settings(max_examples=10)
 def test_blocks_are_the_events_one_by_one(rng, disorder, has_imu, has_covariances, gains, changes):
     settings = Settings(gains=gains, confirmations=1, **changes)
     events = stream(rng, 250, disorder, has_imu, has_covariances)

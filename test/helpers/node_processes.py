@@ -17,7 +17,11 @@ from rcl_interfaces.srv import GetParameterTypes
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+
+from slam_observer_ros.nodes.runner import _reason, REFUSALS
 
 PATIENCE_S = 30.0
 """How long anything may take before a test fails; it normally takes a fraction of a second."""
@@ -51,8 +55,7 @@ class NodeProcess:
         module = ['-m', 'slam_observer_ros.nodes.executables', name]
         command = [sys.executable, *(module if program is None else [str(program)]), '--ros-args']
         always = ALL_ARE_USED if name in OBSERVERS else {}
-        for key, value in (always | parameters).items():
-            command += ['-p', f'{key}:={_yaml(value)}']
+        command += _options(always | parameters)
         NodeProcess.started += 1
         with log.open('w') as output:
             self.process = subprocess.Popen(
@@ -202,6 +205,28 @@ def running(name: str, log: Path, *arguments: str, **parameters: object) -> Iter
     finally:
         node.process.kill()
         node.process.wait()
+
+
+def reason_of_refusal(make_node: Callable[[], Node], *arguments: str, **parameters: object) -> str:
+    """Make a node of this process, which refuses what it is given; return its reason.
+
+    A process would end with the exit code 2 and this as its last line.
+    """
+    rclpy.init(
+        args=['--ros-args', *_options(parameters), *arguments],
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    try:
+        make_node()
+    except REFUSALS as error:
+        return _reason(error)
+    finally:
+        rclpy.shutdown()
+    raise AssertionError('the node has not refused it')
+
+
+def _options(parameters: dict[str, object]) -> list[str]:
+    return [word for key, value in parameters.items() for word in ('-p', f'{key}:={_yaml(value)}')]
 
 
 def _yaml(value: object) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
+
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from node_processes import NodeProcess
+from node_processes import NodeProcess, PATIENCE_S
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -15,8 +17,9 @@ from robots import Robot
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
-from slam_observer_ros.nodes.guarded_node import _refusal
+from slam_observer_ros.nodes.guarded_node import _refusal, Entities, GuardedNode
 from slam_observer_ros.nodes.observer_nodes import LifecycleObserverNode
+from slam_observer_ros.nodes.runner import _executor, turn
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros
@@ -157,6 +160,39 @@ def test_a_managed_node_that_can_not_be_configured_keeps_nothing_of_it(ros_domai
             assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
         assert [len(held) for held in held_by(node)] == before
         node.destroy_node()
+    finally:
+        rclpy.shutdown()
+
+
+def test_what_is_removed_while_it_is_due_is_not_called_any_more(ros_domain_id):
+    rclpy.init()
+    try:
+        node, other, called = GuardedNode('closing'), rclpy.create_node('other'), []
+        executor, entities = _executor(), Entities(node)
+        executor.add_node(node)
+        node.create_steady_timer(0.01, lambda: called.append('timer'))
+        node.create_subscription(Int64, 'number', lambda _: called.append('message'), 10)
+        node.create_service(Trigger, 'act', lambda *_: called.append('service'))
+        publisher = other.create_publisher(Int64, 'number', 10)
+        client = other.create_client(Trigger, 'act')
+
+        def close():
+            if publisher.get_subscription_count() and client.service_is_ready():
+                publisher.publish(Int64())
+                client.call_async(Trigger.Request())
+                time.sleep(0.3)  # all of them are due when it ends
+                entities.remove_new()
+                called.append('closed')
+
+        node.create_steady_timer(0.05, close)
+        deadline = time.monotonic() + PATIENCE_S
+        while 'closed' not in called:
+            assert time.monotonic() < deadline
+            turn(executor)
+        for _ in range(5):
+            turn(executor)
+        assert called[-1] == 'closed'
+        executor.shutdown()
     finally:
         rclpy.shutdown()
 

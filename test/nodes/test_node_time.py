@@ -28,6 +28,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.clouds import decode_point_cloud2
+from slam_observer_ros.nodes.intake.clocks import ClockChange, MAX_LOOKS
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -120,7 +121,7 @@ def test_a_recording_that_is_looped_without_a_pause_is_reset_once_and_loses_noth
     arguments = ('-r', f'__ns:={namespace}', '-r', f'/clock:={namespace}/clock')
     parameters = {'use_sim_time': True, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
     deliveries = list(Simulation(replace(RUN, duration=3.0), SECOND).deliveries())
-    length_s, loops, sent = 3.0, 3, 0
+    length_s, loops, sent = 3.0, 2, 0
     clocks = [(k * 0.025 + max(clock_late_s, 0.0), k * SECOND // 40) for k in range(120)]
 
     def values():
@@ -158,6 +159,15 @@ def test_a_recording_that_is_looped_without_a_pause_is_reset_once_and_loses_noth
     # What comes after /clock has jumped and is of the time before is of no use any more.
     dropped = {key for key in values() if key.startswith('dropped')}
     assert dropped <= ({'dropped: last_run'} if clock_late_s < 0.0 else set())
+
+
+def test_what_seems_to_be_of_the_next_run_is_used_if_the_clock_has_just_been_late():
+    change, use = ClockChange(), Mock()
+    assert change.hold(use, SECOND, 5 * SECOND, usable_from_ns=4 * SECOND)
+    for _ in range(MAX_LOOKS):
+        assert change.take_overdue() == []
+    assert change.take_overdue() == [use]
+    assert not change.is_holding
 
 
 def test_unstamped_velocity_waits_for_the_clock_to_begin(ros, clock, tmp_path):

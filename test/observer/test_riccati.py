@@ -234,7 +234,7 @@ def test_observations_never_determine_where_the_worlds_frame_is(rng):
 
 
 @pytest.mark.parametrize('point_variance_exponents', [(-8.0, 2.0), (-8.0, -8.0), (2.0, 2.0)])
-def test_covariance_stays_symmetric_and_positive_over_hours_of_any_noise(
+def test_covariance_stays_symmetric_and_positive_over_many_steps_of_any_noise(
     point_variance_exponents,
 ):
     rng = np.random.default_rng(4)
@@ -242,7 +242,7 @@ def test_covariance_stays_symmetric_and_positive_over_hours_of_any_noise(
     riccati.add(
         SeenPoints(rng.normal(scale=4.0, size=(3, 3)), np.tile(1e-2 * np.eye(3), (3, 1, 1)))
     )
-    steps, dt_s = 8_000, np.ones(1)
+    steps, dt_s = 3_000, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
     Q = 10.0 ** rng.uniform(-10.0, -2.0, (steps, 1, 6, 1)) * np.eye(6)
     R = 10.0 ** rng.uniform(*point_variance_exponents, (steps, 1, 1, 1)) * np.eye(3)

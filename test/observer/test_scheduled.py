@@ -209,13 +209,13 @@ def test_landmarks_wait_in_few_groups():
 
 
 @pytest.mark.parametrize('point_variance_exponents', [(-8.0, 2.0), (-8.0, -8.0), (2.0, 2.0)])
-def test_covariances_stay_positive_over_hours_of_any_noise(point_variance_exponents):
+def test_covariances_stay_positive_over_many_steps_of_any_noise(point_variance_exponents):
     rng, n = np.random.default_rng(4), 20
     scheduled = ScheduledGains(PLAIN, np.eye(4))
     scheduled.add(
         SeenPoints(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
     )
-    steps, dt_s = 4_000, np.ones(1)
+    steps, dt_s = 1_500, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
     Q = 10.0 ** rng.uniform(-10.0, -2.0, (steps, 1, 6, 1)) * np.eye(6)
     R = 10.0 ** rng.uniform(*point_variance_exponents, (steps, 1, 1, 1)) * np.eye(3)

@@ -155,7 +155,7 @@ def test_moving_landmarks_report_their_velocity_in_the_body_frame() -> None:
         assert_allclose(np.linalg.norm(observation.velocities, axis=-1), 0.7)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.floats(1.0, 359.0), st.floats(1.0, 12.0))
 def test_only_landmarks_in_view_and_range_are_seen(angle_deg: float, range_m: float) -> None:
     scenario = dataclasses.replace(

@@ -96,7 +96,13 @@ Use: TypeAlias = Callable[[], None]
 """Uses a message that was held."""
 
 AROUND_S = 0.5
-"""How much earlier or later than /clock messages of its run may come, by a steady clock."""
+"""How much later than /clock messages of the run before may come, by a steady clock."""
+
+MAX_LOOKS = 25
+"""How often a node looks whether /clock has jumped, every 20 ms, before it uses what it holds.
+
+Not a time: a node that was held up itself has not seen yet what has come meanwhile.
+"""
 
 MAX_HELD = 10_000
 """Messages that may wait for /clock to jump."""
@@ -111,7 +117,7 @@ class ClockChange:
 
     def __init__(self) -> None:
         self._held: list[Use] = []
-        self._held_since_s = 0.0
+        self._looks = 0  # since it holds anything
         self._is_jumping = False
         self._jumped_s = -AROUND_S
         self._back_ns = 0
@@ -144,7 +150,7 @@ class ClockChange:
         if not is_next or len(self._held) >= MAX_HELD:
             return False
         if not self._held:
-            self._held_since_s = time.monotonic()
+            self._looks = 0
         self._held.append(use)
         return True
 
@@ -154,8 +160,8 @@ class ClockChange:
 
     def take_overdue(self) -> list[Use]:
         """Return what was held for too long: the clock does not jump, it was just late."""
-        is_overdue = self._held and time.monotonic() - self._held_since_s > AROUND_S
-        return self._take() if is_overdue else []
+        self._looks += 1
+        return self._take() if self._looks > MAX_LOOKS else []
 
     def _take(self) -> list[Use]:
         held, self._held = self._held, []
