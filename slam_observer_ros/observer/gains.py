@@ -1,8 +1,8 @@
-"""What all gains have in common: how X̂ on SLAM_n(3) is advanced, corrected and extended.
+"""How X̂ on SLAM_n(3) is advanced, corrected and extended, and what is known of its errors.
 
-What a subclass does not override is right for gains that know no noise. What others know of their
-errors is :mod:`.errors`. Landmarks are given by rows (m,), points (m, 3) in the body frame,
-metres, with covariances (m, 3, 3), m².
+Gains that know no joint covariance have no errors, and what a subclass of :class:`Gains` does not
+override is right where no noise is known. Landmarks are given by rows (m,), points (m, 3) in the
+body frame, metres, with covariances (m, 3, 3), m².
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from copy import copy
 import math
-from typing import ClassVar, TYPE_CHECKING
+from typing import ClassVar, Protocol, TYPE_CHECKING
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.observer.errors import Errors
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
+from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-    from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 """Settings without effect on other gains; ``gain_k`` is in the Lyapunov value of all."""
@@ -43,6 +43,79 @@ OF_JOINT_COVARIANCES = (
 """Settings of what only a joint covariance can estimate."""
 
 
+class Errors:
+    """What is known of the errors of an ``observer``'s X̂: what ``joint``, P, says of them.
+
+    Covariances are those of errors in the reference frame, m² and rad².
+    """
+
+    def __init__(self, observer: Observer, joint: JointCovariance, axes: EstimatedAxes) -> None:
+        self.observer, self.joint, self.axes = observer, joint, axes
+
+    def copy(self, observer: Observer) -> Errors:
+        """Return an independent copy for a copy of the observer."""
+        return Errors(observer, self.joint.copy(observer), self.axes)
+
+    def pose_covariance(self, motion: Motion | Passage | None = None) -> FloatArray:
+        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come.
+
+        (s, 6, 6) at the s instants of a passage. Zero on axes that are not estimated.
+        """
+        if motion is None:
+            return self.axes.full_pose_covariance(self.joint.pose)
+        return self.axes.full_pose_covariance(motion.pose_covariance(self.joint.of_robot))
+
+    def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
+        """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
+        points = self.observer.points + duration_s * self.observer.u
+        return self.joint.landmarks(points, duration_s)
+
+    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
+        return self.joint.with_pose(rows, self.observer.points[rows])
+
+    def orientation_matrices(self, rows: IntArray) -> FloatArray:
+        """Return B̂_i (m, 3, 3) of landmarks, zero for those that have none."""
+        return self.joint.turned(rows, self.observer.orientations.B[rows])
+
+    def orientation_sigmas(self, rows: IntArray) -> FloatArray:
+        """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
+        if self.observer.is_exact:
+            sigmas: FloatArray = self.observer.orientations.map_sigmas[rows]
+            return sigmas
+        largest = np.linalg.eigvalsh(self.joint.own_turns(rows))[:, -1]
+        return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
+
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        r, R = residuals.on(self.axes)
+        C = self.joint.output_matrix(residuals, chord=0.5)
+        _, predicted = self.joint.output(C, residuals.rows)
+        return mahalanobis(r, predicted + R)
+
+    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
+        """Return the joint covariance (m k, m k) of residuals, noise included."""
+        return with_blocks(self.predicted(residuals)[1], residuals.on(self.axes)[1])
+
+    def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+        """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
+        C = self.joint.output_matrix(residuals, chord=0.5)
+        return self.joint.outputs(C, residuals.rows)
+
+
+class TagGains(Protocol):
+    """What moves X̂ by how tags are turned."""
+
+    def learn_motion_noise(self, residuals: Residuals) -> None:
+        """Let residuals show how noisy the motion was, before orientations correct it."""
+
+    def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
+        """Move the state by known orientations; return weights (m,), and which are unclear."""
+
+    def add_orientations(self, seen: SeenOrientations) -> None:
+        """Take over orientations as they are seen, where none is known yet."""
+
+
 class Gains(ABC):
     """What moves an ``observer``'s X̂, which starts at ``reference_pose`` P° (4, 4)."""
 
@@ -52,8 +125,8 @@ class Gains(ABC):
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
-        calibration = Calibration(self.estimated(settings), self.axes)
-        self.observer = Observer(reference_pose, calibration)
+        self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
+        self.calibration = Calibration(self.estimated(settings), self.axes)
         self.motion_noise = MotionNoise(settings)
 
     @staticmethod
@@ -64,12 +137,12 @@ class Gains(ABC):
     def copy(self) -> Self:
         """Return an independent copy."""
         other = copy(self)
-        other.observer = self.observer.copy()
+        other.observer, other.calibration = self.observer.copy(), self.calibration.copy()
         other.motion_noise = self.motion_noise.copy()
         return other
 
     @property
-    def tags(self) -> OrientationGains | None:
+    def tags(self) -> TagGains | None:
         """What moves it by orientations of tags; None where only their positions are used."""
         return None
 
@@ -128,7 +201,7 @@ class Gains(ABC):
 
     def add_sensor(self, frame: str) -> None:
         """Let the calibration of the sensor of another frame be part of the state."""
-        self.observer.calibration.add_sensor(frame)
+        self.calibration.add_sensor(frame)
 
     # The frame
 

@@ -20,9 +20,9 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.chart import Chart, sheared
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.motion import Motion
@@ -64,7 +64,7 @@ class JointCovariance:
     def P(self, covariance: FloatArray) -> None:  # noqa: N802
         self._matrix.set(covariance)
 
-    def copy(self, observer: Observer) -> Self:
+    def copy(self, observer: FilterArrays) -> Self:
         """Return an independent copy for a copy of the observer, which has one of P."""
         other = copy(self)
         other._matrix = observer.covariance

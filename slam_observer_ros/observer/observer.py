@@ -7,8 +7,6 @@ reference landmarks are y_i° = P°⁻¹ p_i°, in metres; points y_i (m, 3) see
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -16,20 +14,11 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.arrays import FilterArrays
 
 
-class Postponed(Protocol):
-    """Moves of landmarks that have yet to be made, as looking at a map must not change it."""
-
-    def postponed_shifts(self, rows: IntArray) -> FloatArray:
-        """Return how far the observer has yet to move landmarks (m, 3), metres."""
-
-
 class Observer(FilterArrays):
     """State X̂ on SLAM_n(3) with its reference ξ°: what the paper does to these arrays.
 
     What methods return are copies, with moves that are ``postponed``.
     """
-
-    postponed: Postponed | None = None
 
     @property
     def pose(self) -> FloatArray:

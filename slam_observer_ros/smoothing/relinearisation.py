@@ -20,6 +20,7 @@ from __future__ import annotations
 from copy import copy
 import logging
 import math
+from typing import Protocol
 
 import numpy as np
 
@@ -27,8 +28,9 @@ from slam_observer_ros.common.errors import ParameterError, SmoothingError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.observer.errors import Errors
 from slam_observer_ros.observer.joint_covariance import JointCovariance
+from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -74,28 +76,36 @@ SLIP_TOLERANCE = 1e-4
 """Change below which a solution will do to judge slips by."""
 
 
+class KnownErrors(Protocol):
+    """What there must be of :class:`.Errors`; P may become one for large maps."""
+
+    observer: Observer
+    axes: EstimatedAxes
+    joint: JointCovariance
+
+
 class Relinearisation:
     """What a filter has seen since a prior, and when that is relinearised.
 
-    Relinearising changes the observer and the covariance of ``errors``, given at their start.
+    Relinearising changes the observer and the covariance of ``errors``, and the ``calibration``.
     ``relinearization_*``, ``smoothing_window``, ``huber_threshold``, ``rejection_threshold`` and
     the noise of observations are read from the settings. ``history`` has what was seen.
     """
 
-    def __init__(self, errors: Errors, settings: Settings) -> None:
+    def __init__(self, errors: KnownErrors, calibration: Calibration, settings: Settings) -> None:
         self._errors, self._settings, self._axes = errors, settings, errors.axes
-        self._observer, self._calibration = errors.observer, errors.observer.calibration
+        self._observer, self._calibration = errors.observer, calibration
         self._observation_noise = ObservationNoise(settings)
         self._warning = _Warning()
         self._seen = self._observations = 0
         self._turn_squared = self._largest_turn = 0.0
         self.reset('the last start')
 
-    def copy(self, errors: Errors) -> Relinearisation:
-        """Return an independent copy for a copy of the errors."""
+    def copy(self, errors: KnownErrors, calibration: Calibration) -> Relinearisation:
+        """Return an independent copy for a copy of errors and calibration."""
         other = copy(self)
         other._errors, other._observer = errors, errors.observer
-        other._calibration, other.history = errors.observer.calibration, self.history.copy()
+        other._calibration, other.history = calibration, self.history.copy()
         return other
 
     @property

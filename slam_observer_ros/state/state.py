@@ -12,8 +12,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
-from slam_observer_ros.observer.errors import Errors
-from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.observer.gains import Errors, Gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
@@ -35,14 +34,14 @@ class State:
         self.is_mapping = True  # landmarks are added, and relocated if rejected too often
         self.gains, self.errors = gains, gains.errors  # what moves X̂, what is known of its errors
         self.observer, self.axes = gains.observer, gains.axes
-        self.calibration, self.motion_noise = gains.observer.calibration, gains.motion_noise
+        self.calibration, self.motion_noise = gains.calibration, gains.motion_noise
         self.landmarks = LandmarkTable()
         # How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it.
         is_ignored = 'landmark_velocity_stddev' in gains.ignores
         self.landmark_velocity_stddev = 0.0 if is_ignored else settings.landmark_velocity_stddev
         self.relinearisation: Relinearisation | None = None  # where errors are known
         if self.errors is not None and not self.landmark_velocity_stddev:
-            self.relinearisation = Relinearisation(self.errors, settings)
+            self.relinearisation = Relinearisation(self.errors, self.calibration, settings)
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
         self.was_contradicted = False  # most known landmarks seen last were rejected
@@ -55,10 +54,11 @@ class State:
         other = copy(self)
         other.gains = gains = self.gains.copy()
         other.observer, other.errors = gains.observer, gains.errors
-        other.calibration, other.motion_noise = gains.observer.calibration, gains.motion_noise
+        other.calibration, other.motion_noise = gains.calibration, gains.motion_noise
         other.landmarks, other.counts = self.landmarks.copy(), self.counts.copy()
         if self.relinearisation is not None:
-            other.relinearisation = self.relinearisation.copy(other.known_errors)
+            past = self.relinearisation.copy(other.known_errors, other.calibration)
+            other.relinearisation = past
         return other
 
     @property

@@ -31,7 +31,7 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
         return matched
     gains.learn_motion_noise(matched.residuals)
     tags, gate = state.observer.orientations, state.settings.rejection_threshold
-    are_near = gains.distances(matched.residuals) <= gate
+    are_near = state.gains.distances(matched.residuals) <= gate
     seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
     if not len(seen.rows):
         return matched

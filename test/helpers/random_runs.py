@@ -28,7 +28,7 @@ def propagate(
     filter_: Gains, body_velocities: FloatArray, dt_s: FloatArray, covariances: FloatArray
 ) -> None:
     """Move along velocities (k, 6), held for ``dt_s`` (k,), motions of covariances (k, 6, 6)."""
-    calibration = filter_.observer.calibration
+    calibration = filter_.calibration
     V = calibration.apply(body_velocities)
     path = se3.path(filter_.observer.A, V * dt_s[:, None])
     duration_s, at_ends = float(dt_s.sum()), np.zeros((2, 6))

@@ -170,8 +170,8 @@ def assert_same(compressed, dense, tolerance=1e-9):
         compressed.observer.points, dense.observer.points, rtol=0.0, atol=tolerance
     )
     np.testing.assert_allclose(
-        compressed.observer.calibration.values,
-        dense.observer.calibration.values,
+        compressed.calibration.values,
+        dense.calibration.values,
         rtol=0.0,
         atol=tolerance,
     )

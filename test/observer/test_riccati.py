@@ -24,7 +24,7 @@ from strategies import generators, poses
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.observer.constant import ConstantGains
+from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati import riccati as riccati_module
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
@@ -74,7 +74,7 @@ def residual_after(truth, x):
     """Residuals (3 n,) of what is seen from ``truth``, by an estimate that is off by exp(x)."""
     n = len(truth.points)
     error = slam_group.exp(x[:6], x[6:].reshape(n, 3))
-    estimate = ConstantGains(Settings(), np.eye(4)).observer
+    estimate = Observer(np.eye(4))
     estimate.add_reference_landmarks(se3.rotate(error.A, truth.points) + error.a)
     estimate.A[...] = error.A @ truth.A
     return estimate.errors(slice(None), truth.body_points(np.arange(n)))[1].ravel()

@@ -345,7 +345,7 @@ def test_it_relinearises_after_turning_far_and_soon_after_one_large_turn(turns_r
     settings = Settings(relinearization_interval=20, relinearization_angle=0.2)
     riccati, before = RiccatiGains(settings, np.eye(4)), se3.exp(np.arange(6.0))
     riccati.add_known(KnownLandmarks(np.eye(3), np.tile(np.eye(3), (3, 1, 1))))
-    relinearisation = Relinearisation(riccati.errors, settings)
+    relinearisation = Relinearisation(riccati.errors, riccati.calibration, settings)
     one_point = np.array([0]), np.eye(3)[:1], np.eye(3)[:1], np.eye(3)[None], np.array([np.inf])
     summarised = []
     for turn_rad in turns_rad:

@@ -20,9 +20,9 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.joint_covariance import JointCovariance
-from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
@@ -51,7 +51,7 @@ class CompressedCovariance(JointCovariance):
     active: IntArray
     is_dense = False
 
-    def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
+    def __init__(self, dense: JointCovariance, observer: FilterArrays, size: BlockSize) -> None:
         vars(self).update(vars(dense))
         self._form, self._observer, self._size = copy(dense), observer, size
         self._form._matrix = SymmetricMatrix(self.of_robot)
@@ -62,7 +62,7 @@ class CompressedCovariance(JointCovariance):
         self._corrections, self._most = 0, size.most
         observer.postponed = self
 
-    def copy(self, observer: Observer) -> Self:
+    def copy(self, observer: FilterArrays) -> Self:
         """Return an independent copy, which shares what takes much memory until it changes."""
         other = super().copy(observer)
         other._observer, observer.postponed = observer, other

@@ -15,8 +15,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
-from slam_observer_ros.observer.errors import Errors
-from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.observer.gains import Errors, Gains, TagGains
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import (
@@ -43,7 +42,7 @@ class OrientationGains(Gains):
         self.errors.joint = joint
 
     @property
-    def tags(self) -> OrientationGains | None:
+    def tags(self) -> TagGains | None:
         """Itself, where orientations are estimated."""
         return self if self.joint.chart.turn else None
 

@@ -5,7 +5,7 @@ of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i f
 
     H_i = [ 0  I  0 … −I … 0 ],
 
-or with R̂ D_i at the calibration of the sensor that saw it (:mod:`.sensor_calibration`), and what
+or with R̂ D_i at the calibration of the sensor that saw it (:mod:`.calibration`), and what
 no observation can determine, the choice of the world's frame, is exactly in its null space: the
 covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
 X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
@@ -22,8 +22,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import block_diagonal, solve_symmetric, with_blocks
 from slam_observer_ros.observer.chart import Chart
-from slam_observer_ros.observer.errors import Errors
-from slam_observer_ros.observer.gains import OF_CONSTANT_GAINS
+from slam_observer_ros.observer.gains import Errors, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
@@ -69,11 +68,10 @@ class RiccatiGains(OrientationGains):
         velocity = self.axes.point if speed else 0
         turn = self.axes.turn if settings.use_tag_orientation and not speed else 0
         unknown = [UNKNOWN_RAD] * turn + [speed] * velocity
-        calibration = self.observer.calibration
         joint = JointCovariance(
-            Chart(self.axes, calibration.count, turn, velocity),
+            Chart(self.axes, self.calibration.count, turn, velocity),
             self.observer.covariance,
-            calibration.initial_covariance(),
+            self.calibration.initial_covariance(),
             np.array(unknown) ** 2,
         )
         self.errors = Errors(self.observer, joint, self.axes)
@@ -137,7 +135,7 @@ class RiccatiGains(OrientationGains):
 
     def add_sensor(self, frame: str) -> None:
         """Let the calibration of the sensor of another frame be part of the state, and of P."""
-        sensor = self.observer.calibration.add_sensor(frame)
+        sensor = self.calibration.add_sensor(frame)
         if len(sensor.variances):
             self.joint = self.joint.dense()
             self.joint.add_calibration(sensor.variances)
@@ -284,7 +282,7 @@ class RiccatiGains(OrientationGains):
 
     def _move(self, x: FloatArray) -> None:
         step, observer = self.joint.chart.step(x), self.observer
-        observer.calibration.shift(step.calibration)
+        self.calibration.shift(step.calibration)
         X, moved = step.X, self.joint.active  # none in an exact map
         turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
         observer.correct(X.A, moved, X.a + turned)

@@ -75,7 +75,7 @@ class ScheduledGains(Gains):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        self._core = Core(self.axes, self.observer.calibration)
+        self._core = Core(self.axes, self.calibration)
         self._postponed = self.observer.postponed = self._core.postponed
 
     @staticmethod
@@ -86,7 +86,7 @@ class ScheduledGains(Gains):
     def copy(self) -> Self:
         """Return an independent copy."""
         other = super().copy()
-        other._core = self._core.copy(other.observer.calibration)
+        other._core = self._core.copy(other.calibration)
         other._postponed = other.observer.postponed = other._core.postponed
         return other
 
@@ -207,7 +207,7 @@ class ScheduledGains(Gains):
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
         p = self.axes.p
-        variances: FloatArray = np.diagonal(self._core.P)[p : p + self.observer.calibration.count]
+        variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
         return variances
 
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
@@ -270,7 +270,6 @@ class ScheduledGains(Gains):
 
     def _move(self, rows: IntArray, x: FloatArray, shifts: FloatArray) -> None:
         p, a = self.axes.p, self.observer.a[rows]
-        calibration = self.observer.calibration
-        calibration.shift(x[p : p + calibration.count])
+        self.calibration.shift(x[p : p + self.calibration.count])
         D = se3.exp(self.axes.full_pose(x[:p]))
         self.observer.correct(D, rows, shifts + a - se3.rotate(D, a))
