@@ -19,6 +19,7 @@ import numpy as np
 from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
+    as_its_ids_say,
     Interpretation,
     interpretations,
     is_ambiguous,
@@ -43,8 +44,8 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.delay_evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
-from slam_observer_ros.state import usual
-from slam_observer_ros.state.matching import corrected, match, MatchedObservation
+from slam_observer_ros.state import in_parts, usual
+from slam_observer_ros.state.matching import corrected, match
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, step
 from slam_observer_ros.state.usual import Outcome
@@ -248,20 +249,20 @@ class Hypotheses:
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        if len(self._all) == 1 and (outcome := usual.observe(self.best, event)) is not None:
+        if len(self._all) == 1 and (outcome := _observed(self.best, event)) is not None:
             self._some_have_ids = True
             return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        matches = [match(hypothesis.state, event) for hypothesis in self._all]
         if self.best.errors is None:
-            return self._observe_alone(event, matches[0])
+            return self._observe_alone(event)
         if len(self._all) == 1 and not unknown:
-            is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
-            if is_clear and not may_relabel(self.best, matches[0]):
-                return step(self.best, matches[0])
+            matched = match(self.best, event)
+            is_clear = self._limit == 1 or not is_ambiguous(self.best, matched)
+            if is_clear and not may_relabel(self.best, matched):
+                return step(self.best, matched)
         # All hypotheses with all meanings; costs are over that of the most likely one.
-        children = self._follow(event, self._interpret(event, matches))
+        children = self._follow(event, self._interpret(event))
         least_cost = children[0].hypothesis.cost
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:
@@ -270,8 +271,9 @@ class Hypotheses:
             self._new_landmarks.note(event, self._all[0].visibility.confirmed_now)
         return children[0].outcome
 
-    def _observe_alone(self, event: ObservationEvent, matched: MatchedObservation) -> Outcome:
+    def _observe_alone(self, event: ObservationEvent) -> Outcome:
         """Use an observation that can't be weighed: of a state without a joint covariance."""
+        matched = match(self.best, event)
         if self._contradictions.resolve(self.best, matched):
             matched = match(self.best, event)
         return step(self.best, matched)
@@ -307,6 +309,9 @@ class Hypotheses:
     ) -> _Child:
         """Let a hypothesis use an observation as one interpretation has it."""
         state = hypothesis.state
+        if taken.outcome is not None:
+            hypothesis.cost = taken.cost
+            return _Child(hypothesis, taken.event, taken.outcome)
         state.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
         outcome = step(state, match(state, taken.event))
         if taken.disbelieved is not None:
@@ -317,9 +322,7 @@ class Hypotheses:
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
         return _Child(hypothesis, taken.event, outcome)
 
-    def _interpret(
-        self, event: ObservationEvent, matches: list[MatchedObservation]
-    ) -> list[tuple[int, Interpretation]]:
+    def _interpret(self, event: ObservationEvent) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.
 
         The cost is that of the hypothesis as well. A point has the same id in all of them that
@@ -330,11 +333,14 @@ class Hypotheses:
         new_cost = self._new_landmarks.cost(gate_cost)
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf  # the most that is worth following, the cheapest so far being known
-        for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
+        is_alone = len(self._all) == 1
+        for number, hypothesis in enumerate(self._all):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
-            for taken in interpretations(
-                state, index, seen, matched, new_ids, new_cost, worst - cost, len(self._all) == 1
+            used = None if is_alone else _observed(state, event, is_weighed=True)
+            meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
+            for taken in meanings or interpretations(
+                state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
             ):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
@@ -347,6 +353,12 @@ class Hypotheses:
             ids = hypothesis.state.landmarks.ids
             self._next_id = max(self._next_id, int(np.max(ids[is_automatic(ids)], initial=0)) + 1)
         return self._next_id + np.arange(m)
+
+
+def _observed(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
+    """Let a state use an observation, or a part of it, as usual; None where it is not."""
+    outcome = usual.observe(state, event, is_weighed)
+    return in_parts.observe(state, event, is_weighed) if outcome is None else outcome
 
 
 def _are_one(child: _Child, other: _Child) -> bool:

@@ -25,6 +25,7 @@ from slam_observer_ros.association.costs import (
     SLIP_COST,
 )
 from slam_observer_ros.association.hypothesis import LandmarkIndex
+from slam_observer_ros.association.joint_compatibility import joint_cost
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
@@ -33,6 +34,7 @@ from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import are_far, far_from_the_others
 from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation
 from slam_observer_ros.state.state import State
+from slam_observer_ros.state.usual import Outcome
 
 
 def _none() -> IntArray:
@@ -52,6 +54,7 @@ class Interpretation:
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
+    outcome: Outcome | None = None  # where the state has already used it so
 
 
 def interpretations(
@@ -92,6 +95,15 @@ def interpretations(
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
     without = [_without(ids, state, matched, trusting) for ids in doubted]
     return [trusting, *without, *slipped]
+
+
+def as_its_ids_say(state: State, event: ObservationEvent, outcome: Outcome) -> Interpretation:
+    """Return the only meaning of an observation that a state has used as usual."""
+    weighed, m = outcome.weighed, len(event.ids)
+    cost = m * outlier_cost(state)
+    if weighed is not None:
+        cost = joint_cost(*weighed) + (m - len(weighed.r)) * outlier_cost(state)
+    return Interpretation(event, cost, outcome=outcome)
 
 
 def _without(

@@ -11,7 +11,7 @@
 #include "_door.h" /* first, as it includes Python.h */
 #include "_linear.h"
 
-enum { UNUSUAL = -1, AT_REST = 0, DONE = 1 };
+enum { UNUSUAL = -1, AT_REST = 0, DONE = 1, REJECTS = 2 };
 
 static const double TINY = 2.2250738585072014e-308;
 static const double SPEED_WINDOW_S = 1.0;    /* motion_noise.py */
@@ -19,6 +19,7 @@ static const double MEMORY = 300.0;
 static const double MAX_STEP = 0.5;
 static const double LEAST_LOGARITHM = -4.605170185988091, LARGEST_LOGARITHM = 6.907755278982137;
 static const double RARE = 2.33;
+static const double MAX_SPEED_ERRORS[2] = {50.0, 1000.0};
 static const double RESOLUTION_M = 1e-4;     /* observation_noise.py */
 static const double RELATIVE_RESOLUTION = 1e-6;
 static const double MAX_ERROR_M = 1e3;
@@ -143,12 +144,14 @@ typedef struct {
     const double *V;
     const i64 *since_ns;
     const char *is_stated;
+    const double *covariances;
     double usual_s[2];
     i64 timeout_ns;
     long count;
 } Velocities;
 
-static const char *const VELOCITIES[] = {"lr", "dr6", "lr2", "?r2", "f", "f", "i", NULL};
+static const char *const VELOCITIES[] = {"lr",   "dr6", "lr2", "?r2",
+                                          "dr66", "f",   "f",   "i",   NULL};
 
 typedef struct {
     i64 start_ns, end_ns, delay_ns, reach_ns;
@@ -170,15 +173,14 @@ typedef struct {
 static const char *const ADVANCED[] = {"D44", "Dpp", "Dpp", "Dpc", "D6", "D6", NULL};
 
 typedef struct {
-    const i64 *sorted_ids, *order;
     i64 *counts, *rejections, *last_seen_ns, *seen_before_ns;
 } Landmarks;
 
-static const char *const LANDMARKS[] = {"ln", "ln", "Ln", "Ln", "Ln", "Ln", NULL};
+static const char *const LANDMARKS[] = {"Ln", "Ln", "Ln", "Ln", NULL};
 
 typedef struct {
     i64 stamp_ns;
-    const i64 *ids;
+    const i64 *rows;
     const double *arms, *origins, *covariances, *sensor;
     const i64 *of_sensor;
     i64 column;
@@ -193,7 +195,8 @@ static int read_seen(Door *door, PyObject *tuple, const Estimate *x, Seen *seen)
     seen->c_s = seen->sensor == NULL ? 0 : (long)door->sizes['s'];
     door->sizes['o'] = seen->covariances == NULL ? 0 : seen->m;
     return (seen->column >= 0 && seen->column <= x->c && seen->c_s <= x->c - seen->column
-            && are_within(seen->of_sensor, seen->c_s, 6))
+            && are_within(seen->of_sensor, seen->c_s, 6)
+            && are_within(seen->rows, seen->m, x->n - 1))
            || refuse("Seen");
 }
 
@@ -219,20 +222,21 @@ typedef struct {
 static const char *const FACTORS[] = {"d2pp", "D2", "D22", "D2", "f", NULL};
 
 typedef struct {
-    double *A;
-    i64 *rows;
-    double *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *shift, *judged;
-    int judges;
+    double *A, *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *shift;
+    double *judged, *expected;
+    int judges, says_expected;
 } Observed;
 
-static int read_observed(Door *door, PyObject *tuple, Observed *out) {
-    static const char *const specs[] = {"D44", "Lm",   "Dm3", "Dm3", "Dm", "Dm3",
-                                        "Dm3", "Do33", "Dm",  "Df",  "Dj", NULL};
+static int read_observed(Door *door, PyObject *tuple, const Estimate *x, Observed *out) {
+    static const char *const specs[] = {"D44", "Dm3", "Dm3", "Dm", "Dm3", "Dm3",
+                                        "Do33", "Dm", "Df", "Dj", "De", NULL};
     if (!read_fields(door, tuple, specs, out, "Observed"))
         return 0;
-    Py_ssize_t judged = door->sizes['j'];
-    out->judges = judged > 0;
-    return judged == 0 || judged == 3 * door->sizes['m'] + 1 || refuse("Observed");
+    Py_ssize_t judged = door->sizes['j'], expected = door->sizes['e'], m = door->sizes['m'];
+    out->judges = judged > 0, out->says_expected = expected > 0;
+    return ((judged == 0 || judged == 3 * m + 1)
+            && (expected == 0 || expected == m * (m + 1) * x->k * x->k))
+           || refuse("Observed");
 }
 
 /* ---------------------------------------------------------------------------- a motion: (27) */
@@ -240,7 +244,9 @@ static int read_observed(Door *door, PyObject *tuple, Observed *out) {
 enum { MAX_PIECES = 4096 };
 
 typedef struct {
-    double dt_s, before_s[2], V[6], Q[6]; /* Q: variances of what it moves the robot by */
+    double dt_s, before_s[2], V[6], Q[6]; /* Q: variances of what it moves the robot by, … */
+    double stated[36];                    /* … and covariances, where they were stated */
+    int is_stated[2];
     double until_s, moved[6];             /* sums up to its end */
     int moves;
 } Piece;
@@ -276,7 +282,7 @@ static void calibrated(const Estimate *x, const double V[6], double out[6]) { /*
         out[j] = V[j] * x->calibration[j] + (is_moving ? x->calibration[6 + j] : 0.0);
 }
 
-/* Fill in pieces [first, last); 0 for gaps, and where velocities have covariances of their own. */
+/* Fill in pieces [first, last); 0 for gaps. */
 static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns, i64 end_ns,
                        int is_planar, Piece *pieces) {
     for (long row = first; row < last; row++) {
@@ -285,12 +291,15 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
         i64 begins_ns = row == first ? start_ns : v->stamps_ns[row];
         i64 ends_ns = row + 1 < last ? v->stamps_ns[row + 1] : end_ns;
         if (!is_stamp(begins_ns) || !is_stamp(ends_ns) || !is_stamp(since_ns[0])
-            || !is_stamp(since_ns[1]) || v->is_stated[2 * row] || v->is_stated[2 * row + 1]
-            || since_ns[1] + v->timeout_ns < ends_ns)
+            || !is_stamp(since_ns[1]) || since_ns[1] + v->timeout_ns < ends_ns)
             return 0;
         piece->dt_s = seconds(ends_ns, begins_ns);
         piece->before_s[0] = seconds(begins_ns, since_ns[0]);
         piece->before_s[1] = seconds(begins_ns, since_ns[1]);
+        piece->is_stated[0] = v->is_stated[2 * row];
+        piece->is_stated[1] = v->is_stated[2 * row + 1];
+        if (piece->is_stated[0] || piece->is_stated[1])
+            memcpy(piece->stated, v->covariances + 36 * row, sizeof piece->stated);
         memcpy(piece->V, v->V + 6 * row, sizeof piece->V);
         only_counting(piece->V, is_planar);
         piece->moves = moves(piece->V);
@@ -334,6 +343,21 @@ static void add_scale_noise(Piece *pieces, long k, const double scales[6]) {
     }
 }
 
+/* What is stated is of one error for as long as a velocity is held, which moves the robot by so
+ * much more; errors beyond the largest that there are say no more than these. */
+static void fill_stated(Piece *piece, const double factors[2]) {
+    double grown_s[6], *C = piece->stated;
+    for (int j = 0; j < 6; j++) {
+        double squared = piece->dt_s * (2.0 * piece->before_s[j / 3] + piece->dt_s);
+        double deviation = sqrt(larger(C[7 * j], 0.0)), largest = MAX_SPEED_ERRORS[j / 3];
+        grown_s[j] = sqrt(squared * factors[j / 3]) * largest / larger(deviation, largest);
+        piece->Q[j] *= !piece->is_stated[j / 3];
+    }
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++)
+            C[6 * i + j] *= grown_s[i] * grown_s[j];
+}
+
 /* White noise: held longer than usual, one error has moved the robot by so much more. */
 static void fill_variances(Piece *pieces, long k, const Velocities *v, const Interval *interval,
                            const MotionFigures *figures) {
@@ -359,6 +383,30 @@ static void fill_variances(Piece *pieces, long k, const Velocities *v, const Int
     for (long i = 0; i < k; i++)
         for (int j = 0; j < 6; j++)
             pieces[i].Q[j] *= figures->factors[j / 3];
+    for (long i = 0; i < k; i++)
+        if (pieces[i].is_stated[0] || pieces[i].is_stated[1])
+            fill_stated(&pieces[i], figures->factors);
+}
+
+static const double *stated_of(const Piece *piece) { /* NULL where nothing is stated */
+    return piece && (piece->is_stated[0] || piece->is_stated[1]) ? piece->stated : NULL;
+}
+
+/* Add Ad Q Ad' of what is stated: half of the pieces before and after a pose, either of which may
+ * be NULL. What turning and driving share is half theirs. */
+static void add_stated(int p, const double Ad[36], const double *before, const double *after,
+                       const Advanced *out) {
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++) {
+            int e = 6 * i + j;
+            double Q = 0.5 * ((before ? before[e] : 0.0) + (after ? after[e] : 0.0));
+            double turning = 0.5 * ((i < 3) + (j < 3)) * Q;
+            for (int s = 0; s < p; s++)
+                for (int t = s; t < p && Q != 0.0; t++) {
+                    out->noise[s * p + t] += Ad[6 * s + i] * Q * Ad[6 * t + j];
+                    out->of_turning[s * p + t] += Ad[6 * s + i] * turning * Ad[6 * t + j];
+                }
+        }
 }
 
 /* The estimated rows of Ad = [[R, 0], [hat(x) R, R]], (p, 6). */
@@ -392,6 +440,8 @@ static void add_at_pose(const Estimate *x, const double Ad[36], const Piece *bef
             out->of_turning[s * p + t] += turning;
             out->noise[s * p + t] += turning + driving;
         }
+    if (stated_of(before) || stated_of(after))
+        add_stated(p, Ad, stated_of(before), stated_of(after), out);
     for (long j = 0; j < x->c_v; j++) {
         int column = (int)x->estimated[j] % 6, is_bias = x->estimated[j] >= 6;
         double share = 0.0;
@@ -573,8 +623,9 @@ static int advance(const Estimate *x, const Velocities *v, const Interval *inter
         memset(out->variances, 0, 6 * sizeof(double));
         for (long i = 0; i < k; i++) {
             status = pieces[i].moves ? DONE : status;
+            const double *stated = stated_of(&pieces[i]);
             for (int j = 0; j < 6; j++)
-                out->variances[j] += pieces[i].Q[j];
+                out->variances[j] += pieces[i].Q[j] + (stated ? stated[7 * j] : 0.0);
         }
         for (long i = 0; i < k; i++)
             status = pieces[i].dt_s == 0.0 ? AT_REST : status;
@@ -601,6 +652,7 @@ enum { MAX_SEEN = 64 };
 typedef struct {
     long m, M, q;
     int k, has_sensor;
+    const i64 *rows;         /* (m) which landmarks are seen */
     double *points, *stated; /* (m, 3) estimated; (m, 3, 3) covariances as stated, body frame */
     double *r, *R;           /* (M); (m, k, k) */
     double *D;               /* (M, c) how r changes with the calibration */
@@ -624,11 +676,6 @@ static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory)
     TAKE(dx, (size_t)x->N), TAKE(weights, n);
 #undef TAKE
     return used;
-}
-
-static i64 row_of(const Landmarks *table, long n, i64 id) { /* -1 for a new one */
-    long at = rows_up_to(table->sorted_ids, n, id, 0);
-    return at < n && table->sorted_ids[at] == id ? table->order[at] : -1;
 }
 
 static void add_to_diagonal(double C[9], double variance) {
@@ -732,13 +779,14 @@ static double repetition_factor(double dt_s, double error_time_s) {
     return (2.0 - fresh) / fresh;
 }
 
-/* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a landmark is new or in doubt. */
+/* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a landmark is in doubt. */
 static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen *seen,
                           const PointFigures *figures, const Limits *limits, const Observed *out,
                           Residuals *res) {
     Pose pose = pose_of(x->A);
     double turned[9] = {0.0}, J[9] = {0.0};
     int k = x->k;
+    res->rows = seen->rows;
     res->has_sensor = seen->sensor != NULL && seen->c_s > 0;
     if (seen->sensor != NULL) {
         exp_and_jacobian(seen->sensor, turned, J);
@@ -746,9 +794,8 @@ static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen 
             turned[i] *= exp(seen->sensor[6]);
     }
     for (long i = 0; i < seen->m; i++) {
-        i64 row = row_of(table, x->n, seen->ids[i]);
-        if (row < 0 || row >= x->n || !is_stamp(table->last_seen_ns[row])
-            || !is_stamp(table->seen_before_ns[row]))
+        i64 row = seen->rows[i];
+        if (!is_stamp(table->last_seen_ns[row]) || !is_stamp(table->seen_before_ns[row]))
             return 0;
         i64 count = table->counts[row], needed = limits->max_rejections;
         if (table->rejections[row] >= (count < needed ? count + 1 : needed))
@@ -787,7 +834,6 @@ static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen 
         }
         if (res->has_sensor)
             fill_sensitivity(x, seen, pose.R, J, expected, res->D + k * x->c * i);
-        out->rows[i] = row;
         out->dt_s[i] = unseen_s(table, row, seen->stamp_ns);
         res->repeated[i] = repetition_factor(out->dt_s[i], limits->error_time_s);
     }
@@ -806,8 +852,8 @@ static void output_matrix(const Estimate *x, const double y[3], double *C, long 
     }
 }
 
-static long column_of(const Estimate *x, const Observed *out, long entry) {
-    return x->first + x->k * (long)out->rows[entry / x->k] + entry % x->k;
+static long column_of(const Estimate *x, const Residuals *res, long entry) {
+    return x->first + x->k * (long)res->rows[entry / x->k] + entry % x->k;
 }
 
 static void with_noise(const Residuals *res, const double *predicted, const double *factors,
@@ -837,7 +883,7 @@ static void fill_predicted(const Estimate *x, const Observed *out, Residuals *re
                    (size_t)x->c * sizeof(double));
     }
     for (long i = 0; i < M; i++) {
-        const double *C = res->C + i * q, *own = x->P + column_of(x, out, i) * x->room;
+        const double *C = res->C + i * q, *own = x->P + column_of(x, res, i) * x->room;
         double half[64], *T = res->T + i * q;
         memcpy(T, own, (size_t)q * sizeof(double));
         for (long t = 0; t < q; t++) {
@@ -847,7 +893,7 @@ static void fill_predicted(const Estimate *x, const Observed *out, Residuals *re
         }
         for (long j = 0; j <= i; j++) {
             const double *C_j = res->C + j * q, *T_j = res->T + j * q;
-            double sum = own[column_of(x, out, j)];
+            double sum = own[column_of(x, res, j)];
             for (long t = 0; t < q; t++)
                 sum += half[t] * C_j[t] - C[t] * T_j[t];
             res->predicted[i * M + j] = res->predicted[j * M + i] = sum;
@@ -879,18 +925,37 @@ static int is_far_from_the_others(const Residuals *res, long i, double gate, dou
     return square < 0.0 ? -1 : sqrt(square) > SUSPICION * gate;
 }
 
-/* S = C P C' + R, factored; 0 where a point is rejected, or may be something else. */
+/* How far off each residual was, its density given those before it, shares; then all together. */
+static void write_judged(const Residuals *res, double *judged) {
+    long m = res->m, M = res->M;
+    int k = res->k;
+    for (long i = 0; i < m; i++) {
+        double block[9], sum = 0.0;
+        copy_block(res->S, M, i, k, block);
+        judged[i] = sqrt(larger(squared_distance(res->r + k * i, block, k), 0.0));
+        for (long e = k * i; e < k * (i + 1); e++)
+            sum += 0.5 * res->z[e] * res->z[e] + log(res->L[e * M + e]) + LOG_ROOT_2_PI;
+        judged[m + i] = -sum;
+        judged[2 * m + i] = 1.0 / res->repeated[i];
+    }
+    judged[3 * m] = sum_of_squares(res->z, M);
+}
+
+/* S = C P C' + R, factored; UNUSUAL where that fails, or a point may be something else, REJECTS
+ * where the weights say which ones are rejected. */
 static int judge(const Estimate *x, const Limits *limits, const Observed *out, Residuals *res) {
     long M = res->M;
-    int k = res->k;
+    int k = res->k, status = DONE;
     double gate = limits->gate, block[9];
     fill_predicted(x, out, res);
     with_noise(res, res->predicted, NULL, NULL, res->S);
     memcpy(res->L, res->S, (size_t)(M * M) * sizeof(double));
     if (!factor(res->L, M))
-        return 0;
+        return UNUSUAL;
     memcpy(res->z, res->r, (size_t)M * sizeof(double));
     solve_lower(res->L, M, res->z);
+    if (out->judges)
+        write_judged(res, out->judged);
     memcpy(res->S_inv_r, res->z, (size_t)M * sizeof(double));
     solve_upper(res->L, M, res->S_inv_r);
     /* No residual is further out than all of them together are. */
@@ -898,17 +963,16 @@ static int judge(const Estimate *x, const Limits *limits, const Observed *out, R
         for (long i = 0; i < res->m; i++) {
             copy_block(res->S, M, i, k, block);
             double square = squared_distance(res->r + k * i, block, k);
-            if (square < 0.0 || sqrt(square) > gate)
-                return 0;
+            out->weights[i] = square >= 0.0 && sqrt(square) <= gate;
+            status = out->weights[i] == 0.0 ? REJECTS : status;
         }
-    for (long i = 0; i < res->m && limits->weighs_meanings; i++) {
+    for (long i = 0; i < res->m && limits->weighs_meanings && status == DONE; i++) {
         double square = squared_distance(res->r + k * i, res->R + k * k * i, k);
-        if (square < 0.0)
-            return 0;
-        if (sqrt(square) > SUSPICION * gate && is_far_from_the_others(res, i, gate, res->W))
-            return 0;
+        if (square < 0.0
+            || (sqrt(square) > SUSPICION * gate && is_far_from_the_others(res, i, gate, res->W)))
+            status = UNUSUAL;
     }
-    return 1;
+    return status;
 }
 
 /* g and F of motion_noise.py, from u = C' S^-1 r and G = C' S^-1 C. */
@@ -957,23 +1021,13 @@ static void step_factors(const Factors *factors, const double g[2], const double
     }
 }
 
-/* What these residuals say of the noise of the motion; 0 if some are to be left out of that.
- * ``work``: M (M + p + 1). */
+/* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms
+ * has it, which may be less than is applied; 0 if it is indefinite. ``work``: M (M + p + 1). */
 static int learn(const Estimate *x, const Factors *factors, double gate, const Observed *out,
                  const Residuals *res, double *work, double logs[2], double information[4]) {
-    long M = res->M;
-    int p = x->p, k = res->k;
-    double N[72], change[36] = {0.0}, block[9], u[6] = {0.0}, G[36] = {0.0}, g[2], F[4];
-    double *L = work, *Y = work + M * M, *z = Y + M * p;
-    /* C at the middle between where landmarks are expected and seen. */
-    for (long i = 0; i < res->m; i++) {
-        double middle[3];
-        for (int b = 0; b < 3; b++)
-            middle[b] = res->points[3 * i + b] + 0.5 * out->r[3 * i + b];
-        output_matrix(x, middle, Y + k * i * p, p);
-    }
-    /* As the likelihood at the logarithms has it, which may be less than is applied. */
-    memcpy(L, res->S, (size_t)(M * M) * sizeof(double));
+    int p = x->p, k = res->k, at[3 * MAX_SEEN], kept[3 * MAX_SEEN];
+    double N[72], change[36] = {0.0}, u[6] = {0.0}, G[36] = {0.0}, g[2], F[4];
+    double *L = work, *Y = L + res->M * res->M, *z = Y + res->M * p, squared;
     for (int j = 0; j < 2; j++) {
         double ratio = exp(factors->logs[j]) / factors->applied[j];
         for (int e = 0; e < p * p; e++) {
@@ -981,28 +1035,45 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
             change[e] += N[p * p * j + e] - factors->shares[p * p * j + e];
         }
     }
-    for (long i = 0; i < M; i++) {
-        double half[6] = {0.0};
-        for (int s = 0; s < p; s++)
-            for (int t = 0; t < p; t++)
-                half[t] += Y[i * p + s] * change[p * s + t];
-        for (long j = 0; j < M; j++)
-            for (int t = 0; t < p; t++)
-                L[i * M + j] += half[t] * Y[j * p + t];
+    long M = res->M, passed; /* entries ``at`` of the residuals: at first all */
+    for (int i = 0; i < M; i++)
+        at[i] = i;
+    for (;;) {
+        for (long i = 0; i < M; i += k) { /* C in the middle between expected and seen */
+            double middle[3];
+            for (int b = 0; b < 3; b++)
+                middle[b] = res->points[3 * (at[i] / k) + b] + 0.5 * out->r[3 * (at[i] / k) + b];
+            output_matrix(x, middle, Y + i * p, p);
+        }
+        for (long i = 0; i < M; i++) {
+            double half[6] = {0.0};
+            for (int s = 0; s < p; s++)
+                for (int t = 0; t < p; t++)
+                    half[t] += Y[i * p + s] * change[p * s + t];
+            for (long j = 0; j < M; j++) {
+                L[i * M + j] = res->S[at[i] * res->M + at[j]];
+                for (int t = 0; t < p; t++)
+                    L[i * M + j] += half[t] * Y[j * p + t];
+            }
+            z[i] = res->r[at[i]];
+        }
+        passed = 0;
+        for (long i = 0; i < M; i += k) {
+            double block[9];
+            copy_block(L, M, i / k, k, block);
+            double square = squared_distance(z + i, block, k);
+            for (int b = 0; b < k && square >= 0.0 && sqrt(square) <= gate; b++)
+                kept[passed++] = at[i + b];
+        }
+        if (!factor(L, M))
+            return 0;
+        solve_lower(L, M, z);
+        squared = sum_of_squares(z, M);
+        if (squared <= gate * gate || 2 * passed <= M || passed == M)
+            break;
+        M = passed; /* some few are left out */
+        memcpy(at, kept, sizeof at);
     }
-    long passed = 0;
-    for (long i = 0; i < res->m; i++) {
-        copy_block(L, M, i, k, block);
-        double square = squared_distance(res->r + k * i, block, k);
-        passed += square >= 0.0 && sqrt(square) <= gate;
-    }
-    if (!factor(L, M))
-        return 0;
-    memcpy(z, res->r, (size_t)M * sizeof(double));
-    solve_lower(L, M, z);
-    double squared = sum_of_squares(z, M);
-    if (squared > gate * gate && res->m < 2 * passed && passed < res->m)
-        return 0;
     solve_lower_rows(L, M, Y, p, p);
     for (long i = 0; i < M; i++)
         for (int s = 0; s < p; s++) {
@@ -1050,13 +1121,13 @@ static int fill_weights(double huber, Residuals *res, double *work) {
 
 /* (30), (31)  dx = -K r, K = P H' S^-1, and P - K H P; 0 if S is indefinite.
  * H takes C at the landmark itself: so no observation says anything of the gauge. */
-static int correct(const Estimate *x, const Observed *out, Residuals *res, double *L) {
+static int correct(const Estimate *x, Residuals *res, double *L) {
     long M = res->M, N = x->N, c = res->has_sensor ? x->c : 0;
     const double *P = x->P;
     for (long i = 0; i < M; i++) { /* H P */
         double *row = res->W + i * N;
         const double *of_shift = P + (x->turns + i % x->k) * x->room;
-        const double *of_landmark = P + column_of(x, out, i) * x->room;
+        const double *of_landmark = P + column_of(x, res, i) * x->room;
         for (long j = 0; j < N; j++)
             row[j] = of_shift[j] - of_landmark[j];
         for (long t = 0; t < c; t++) {
@@ -1069,7 +1140,7 @@ static int correct(const Estimate *x, const Observed *out, Residuals *res, doubl
     for (long i = 0; i < M; i++) /* H P H' */
         for (long j = 0; j < M; j++) {
             const double *row = res->W + i * N;
-            double sum = row[x->turns + j % x->k] - row[column_of(x, out, j)];
+            double sum = row[x->turns + j % x->k] - row[column_of(x, res, j)];
             for (long t = 0; t < c; t++)
                 sum += res->D[j * x->c + t] * row[x->p + t];
             res->predicted[i * M + j] = sum;
@@ -1116,29 +1187,13 @@ static void move(const Estimate *x, const double *dx, const Observed *out) {
     memcpy(out->shift, dx + x->p, (size_t)(x->first - x->p) * sizeof(double));
 }
 
-/* How far off each residual was, its density given those before it, shares; then all together. */
-static void write_judged(const Residuals *res, double *judged) {
-    long m = res->m, M = res->M;
-    int k = res->k;
-    for (long i = 0; i < m; i++) {
-        double block[9], sum = 0.0;
-        copy_block(res->S, M, i, k, block);
-        judged[i] = sqrt(larger(squared_distance(res->r + k * i, block, k), 0.0));
-        for (long e = k * i; e < k * (i + 1); e++)
-            sum += 0.5 * res->z[e] * res->z[e] + log(res->L[e * M + e]) + LOG_ROOT_2_PI;
-        judged[m + i] = -sum;
-        judged[2 * m + i] = 1.0 / res->repeated[i];
-    }
-    judged[3 * m] = sum_of_squares(res->z, M);
-}
-
 /* Note that landmarks were seen, and where they should have been by the corrected state. */
 static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Observed *out,
                    const Residuals *res) {
     Pose pose = pose_of(out->A);
     for (long i = 0; i < res->m; i++) {
-        i64 row = out->rows[i];
+        i64 row = seen->rows[i];
         table->counts[row] += 1;
         table->rejections[row] = 0;
         if (table->last_seen_ns[row] < seen->stamp_ns) {
@@ -1173,26 +1228,31 @@ static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
         return UNUSUAL;
     lay_out(&res, x, seen->m, memory);
     double *work = memory + numbers, logs[2], information[4];
-    int is_usual = fill_residuals(x, table, seen, figures, limits, out, &res)
-                   && judge(x, limits, out, &res)
-                   && (!factors->are_there
-                       || learn(x, factors, limits->gate, out, &res, work, logs, information))
-                   && fill_weights(limits->huber, &res, work) && correct(x, out, &res, work);
-    if (is_usual) {
+    int status = UNUSUAL;
+    if (fill_residuals(x, table, seen, figures, limits, out, &res))
+        status = judge(x, limits, out, &res);
+    if (status != UNUSUAL && factors->are_there
+        && !learn(x, factors, limits->gate, out, &res, work, logs, information))
+        status = UNUSUAL;
+    if (status == DONE && !(fill_weights(limits->huber, &res, work) && correct(x, &res, work)))
+        status = UNUSUAL;
+    for (int j = 0; j < 2 && status != UNUSUAL && factors->are_there; j++) {
+        factors->logs[j] = logs[j];
+        memcpy(factors->information + 2 * j, information + 2 * j, 2 * sizeof(double));
+        if (factors->least < INFINITY)
+            factors->applied[j] = exp(larger(logs[j], factors->least));
+    }
+    if (status == DONE) {
         move(x, res.dx, out);
         memcpy(out->weights, res.weights, (size_t)res.m * sizeof(double));
-        for (int j = 0; j < 2 && factors->are_there; j++) {
-            factors->logs[j] = logs[j];
-            memcpy(factors->information + 2 * j, information + 2 * j, 2 * sizeof(double));
-            if (factors->least < INFINITY)
-                factors->applied[j] = exp(larger(logs[j], factors->least));
+        if (out->says_expected) {
+            memcpy(out->expected, res.S, M * M * sizeof(double));
+            memcpy(out->expected + M * M, res.R, M * (size_t)res.k * sizeof(double));
         }
-        if (out->judges)
-            write_judged(&res, out->judged);
         record(x, table, seen, figures, limits, out, &res);
     }
     PyMem_Free(memory);
-    return is_usual ? DONE : UNUSUAL;
+    return status;
 }
 
 /* ---------------------------------------------------------------------------------- the module */
@@ -1240,7 +1300,7 @@ static PyObject *py_observe(PyObject *Py_UNUSED(self), PyObject *const *args, Py
              && read_fields(&door, args[3], POINT_FIGURES, &figures, "PointFigures")
              && read_fields(&door, args[4], LIMITS, &limits, "Limits")
              && (!factors.are_there || read_fields(&door, args[5], FACTORS, &factors, "Factors"))
-             && read_observed(&door, args[6], &out))
+             && read_observed(&door, args[6], &x, &out))
         status = observe(&x, &table, &seen, &figures, &limits, &factors, &out);
     close_door(&door);
     return PyErr_Occurred() ? NULL : PyLong_FromLong(status);

@@ -50,8 +50,6 @@ class Advanced(NamedTuple):
 class Landmarks(NamedTuple):
     """What is known of each of n landmarks, changed in place."""
 
-    sorted_ids: IntArray  # (n,)
-    order: IntArray  # (n,) which landmark each of these is
     counts: IntArray  # (n,) as in :class:`.LandmarkTable`, and so the others
     rejections: IntArray
     last_seen_ns: IntArray
@@ -62,7 +60,7 @@ class Seen(NamedTuple):
     """Points seen, body frame, and the sensor that saw them, if it is calibrated."""
 
     stamp_ns: int
-    ids: IntArray  # (m,)
+    rows: IntArray  # (m,) which landmarks they are of
     arms: FloatArray  # (m, 3) from the sensor to each point, metres
     origins: FloatArray | None  # (m, 3) where the sensor was, metres; None at the base
     covariances: FloatArray | None  # (m, 3, 3) as stated, m²; None for those of the figures
@@ -86,10 +84,9 @@ class Observed(NamedTuple):
     """What an observation did, written by :func:`.observe`."""
 
     A: FloatArray  # (4, 4) Â after it
-    rows: IntArray  # (m,) which landmarks were seen
     points: FloatArray  # (m, 3) where, by the calibration of the sensor, body frame
     r: FloatArray  # (m, 3) residuals (29)
-    weights: FloatArray  # (m,) Huber's
+    weights: FloatArray  # (m,) Huber's; of a point that is rejected 0
     origins: FloatArray  # (m, 3) where the sensor was, body frame
     lines_of_sight: FloatArray  # (m, 3) from the sensor to where each should be now
     # (m, 3, 3) of the points, body frame, m²; (0, 3, 3) where none were stated
@@ -100,3 +97,5 @@ class Observed(NamedTuple):
     # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
     # normalised innovation squared of all; empty where nobody asks
     judged: FloatArray
+    # S (m k, m k) of the residuals, m², then R (m, k, k), what of that is of the points; or empty
+    expected: FloatArray

@@ -2,7 +2,8 @@
 
 A motion along velocities without a gap, and an observation whose points are all of known
 landmarks, none of them in doubt. Anything else is UNUSUAL, and nothing is changed then: the
-filters' own methods go on from there.
+filters' own methods go on from there. Points that are rejected, or of new landmarks, are left
+out by who calls it.
 
 The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω: see :mod:`.chart`.
 """
@@ -47,6 +48,7 @@ from slam_observer_ros.sensor_models.motion_noise import (
     motion_variances,
     MotionFigures,
     score,
+    stated_motion_covariances,
 )
 from slam_observer_ros.sensor_models.observation_noise import (
     point_covariances,
@@ -57,8 +59,12 @@ from slam_observer_ros.sensor_models.observation_noise import (
 )
 from slam_observer_ros.sensor_models.velocity_history import Velocities
 
-UNUSUAL, AT_REST, DONE = -1, 0, 1
-"""What a step returns; AT_REST where the motion says nothing of the noise of velocities."""
+UNUSUAL, AT_REST, DONE, REJECTS = -1, 0, 1, 2
+"""What a step returns; AT_REST where the motion says nothing of the noise of velocities.
+
+REJECTS where the gate does not let all points pass: nothing is changed then, but weights say which
+ones it rejects, and what all of them show of the noise is learnt.
+"""
 
 _PLANAR = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
 LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
@@ -75,10 +81,11 @@ def advance(
     out: Advanced,
 ) -> int:
     """Move X̂ along velocities (27), with what that does to P."""
-    pieces = _pieces(velocities, interval, x.is_planar)
+    pieces = _pieces(velocities, interval)
     if pieces is None:
         return UNUSUAL
-    V, dt_s, before_s = pieces
+    rows, dt_s, before_s = pieces
+    V = _counting(velocities.body_velocities[rows], x.is_planar)
     axes, (p, c) = axes_of(x.is_planar), out.sensitivity.shape
     # (27)  Â ← Â exp(V dt), V = (1 + s) ∘ V_measured + b
     path = se3.path(x.A, _calibrated(x, V) * dt_s[:, None])
@@ -90,8 +97,17 @@ def advance(
     usual_s = np.array([velocities.usual_angular_s, velocities.usual_linear_s])
     usual_s += max(to_s(-interval.delay_ns), 0.0)
     Q = motion_variances(V, dt_s, before_s, usual_s, figures)
+    is_stated, stated = velocities.is_stated[rows], None
+    if np.count_nonzero(is_stated):
+        Q[np.repeat(is_stated, 3, axis=1)] = 0.0
+        stated = stated_motion_covariances(
+            velocities.covariances[rows], dt_s, before_s, figures.factors
+        )
     out.variances[:] = Q.sum(axis=0)
     _summed_noise(Ad, se3.at_poses(Q), out)
+    if stated is not None:
+        out.variances[:] += np.diagonal(stated.sum(axis=0))
+        _add_summed(Ad, se3.at_poses(stated), out)
     F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
     # x ← x + J (F c̃ + w), and ξ_i ← ξ_i + [ŷ_i]× ε_Ω of what is added to ε
     P, of_c = x.P, slice(p, p + c)
@@ -107,23 +123,19 @@ def advance(
 
 
 def _pieces(
-    velocities: Velocities, interval: Interval, is_planar: bool
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return velocities (k, 6), for how long each is held, and (k, 2) was before; None for gaps.
-
-    None, too, where some of them come with covariances of their own.
-    """
+    velocities: Velocities, interval: Interval
+) -> tuple[slice, FloatArray, FloatArray] | None:
+    """Return k velocities, for how long each is held, and (k, 2) was before; None for gaps."""
     start_ns, end_ns = interval.start_ns - interval.delay_ns, interval.end_ns - interval.delay_ns
     first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
     last = max(int(velocities.stamps_ns.searchsorted(end_ns, 'left')), first + 1)
     bounds_ns = np.append(velocities.stamps_ns[first:last], end_ns)
-    if end_ns < start_ns or first < 0 or velocities.is_stated[first:last].any():
+    if end_ns < start_ns or first < 0:
         return None
     bounds_ns[0], since_ns = start_ns, velocities.since_ns[first:last]
     if (since_ns[:, 1] + velocities.timeout_ns < bounds_ns[1:]).any():
         return None
-    V = _counting(velocities.body_velocities[first:last], is_planar)
-    return V, to_s(np.diff(bounds_ns)), to_s(bounds_ns[:-1, None] - since_ns)
+    return slice(first, last), to_s(np.diff(bounds_ns)), to_s(bounds_ns[:-1, None] - since_ns)
 
 
 def _counting(V: FloatArray, is_planar: bool) -> FloatArray:
@@ -143,6 +155,16 @@ def _summed_noise(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
     out.noise[:] = (flat * shares.ravel()).dot(flat.T)
     shares[:, 3:] = 0.0
     out.of_turning[:] = (flat * shares.ravel()).dot(flat.T)
+
+
+def _add_summed(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
+    """Add Σ Ad_Â Q Ad_Âᵀ, ``shares`` (k + 1, 6, 6) of Q; what both kinds share is half theirs."""
+    p = len(out.noise)
+    flat = Ad.swapaxes(0, 1).reshape(p, -1)
+    out.noise[:] += (Ad @ shares).swapaxes(0, 1).reshape(p, -1).dot(flat.T)
+    shares[:, :, 3:] = 0.0
+    half = 0.5 * (Ad @ shares).swapaxes(0, 1).reshape(p, -1).dot(flat.T)
+    out.of_turning[:] += half + half.T
 
 
 def _sensitivity(
@@ -197,7 +219,6 @@ def _mean_about(
 class _Residuals(NamedTuple):
     """What m points say against the state, in the reference frame, on k estimated axes."""
 
-    rows: IntArray  # (m,) which landmarks are seen
     columns: IntArray  # (m k,) theirs in P
     points: FloatArray  # (m, 3) ŷ_i
     r: FloatArray  # (m, 3) r_i (29)
@@ -226,6 +247,7 @@ class _Judged(NamedTuple):
     S: FloatArray  # (m k, m k) with the noise of the points
     L: FloatArray  # (m k, m k) L Lᵀ = S
     S_inv_r: FloatArray  # (m k,)
+    distances: FloatArray | None  # (m,) Mahalanobis distance of each; None if it does not matter
 
 
 def observe(
@@ -245,8 +267,16 @@ def observe(
     judged = None if residuals is None else _judged(x, residuals, limits)
     if residuals is None or judged is None:
         return UNUSUAL
+    if len(out.judged):
+        _write_judged(residuals, judged, out.judged)
     learnt = None if factors is None else _learnt(factors, residuals, judged.S, limits.gate)
     if factors is not None and learnt is None:
+        return UNUSUAL
+    if judged.distances is not None and np.count_nonzero(judged.distances > limits.gate):
+        out.weights[:] = judged.distances <= limits.gate
+        _take_over(factors, learnt)
+        return REJECTS
+    if limits.weighs_meanings and _may_be_something_else(residuals, judged, limits.gate):
         return UNUSUAL
     weights = _weights(residuals, judged, limits)
     dx = None if weights is None else _correct(x, residuals, weights)
@@ -260,12 +290,9 @@ def observe(
     x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))
     out.shift[:] = dx[axes.p : x.first]
     out.weights[:] = weights
-    if factors is not None and learnt is not None:
-        factors.information[:], factors.logs[:] = learnt
-        if factors.least < math.inf:
-            factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
-    if len(out.judged):
-        _write_judged(residuals, judged, out.judged)
+    _take_over(factors, learnt)
+    if len(out.expected):
+        out.expected[:] = np.append(judged.S, residuals.R)
     _record(x, landmarks, seen, limits, out)
     if residuals.stated is not None:
         out.covariances[:] = stated_covariances(
@@ -282,11 +309,8 @@ def _residuals(
     limits: Limits,
     out: Observed,
 ) -> _Residuals | None:
-    """Return the residuals (29); None where a landmark is new or in doubt."""
-    at = landmarks.sorted_ids.searchsorted(seen.ids)
-    rows = landmarks.order.take(at, mode='clip')
-    if np.count_nonzero(landmarks.sorted_ids.take(at, mode='clip') == seen.ids) < len(at):
-        return None
+    """Return the residuals (29); None where a landmark is in doubt."""
+    rows = seen.rows
     counts, rejections = landmarks.counts.take(rows), landmarks.rejections.take(rows)
     if np.count_nonzero(rejections >= np.minimum(counts + 1, limits.max_rejections)):
         return None
@@ -313,10 +337,9 @@ def _residuals(
         D = np.zeros((len(r), k, len(x.drift)))
         of_sensor = sensor_sensitivity(seen.sensor, expected - origins)[:, :, seen.of_sensor]
         D[:, :, seen.column : seen.column + len(seen.of_sensor)] = (R_hat @ of_sensor)[:, :k]
-    out.rows[:], out.points[:], out.r[:], out.origins[:] = rows, y, r, origins
+    out.points[:], out.r[:], out.origins[:] = y, r, origins
     out.dt_s[:] = dt_s = _unseen_s(landmarks, rows, seen.stamp_ns)
     return _Residuals(
-        rows,
         (x.first + np.arange(k) + k * rows[:, None]).ravel(),
         points,
         r,
@@ -355,7 +378,7 @@ def _unseen_s(landmarks: Landmarks, rows: IntArray, stamp_ns: int) -> FloatArray
 
 
 def _judged(x: Estimate, residuals: _Residuals, limits: Limits) -> _Judged | None:
-    """Return S = C P Cᵀ + R, factored; None where a point is rejected, or may be something else.
+    """Return S = C P Cᵀ + R, factored; None if it is indefinite.
 
     C is taken in the middle between ŷ_i and the point seen: turning moves at right angles to it.
     """
@@ -369,44 +392,55 @@ def _judged(x: Estimate, residuals: _Residuals, limits: Limits) -> _Judged | Non
     L, is_indefinite = dpotrf(S, lower=1)
     if is_indefinite:
         return None
-    S_inv_r = dpotrs(L, residuals.flat, lower=1)[0]
-    r = residuals.r[:, : axes.point]
+    S_inv_r, distances = dpotrs(L, residuals.flat, lower=1)[0], None
     # No residual is further out than all of them together are.
     if residuals.flat.dot(S_inv_r) > limits.gate**2:
-        distances = mahalanobis(r, diagonal_blocks(S, axes.point))
-        if np.count_nonzero(distances > limits.gate):
-            return None
-    if limits.weighs_meanings:
-        far = are_far(mahalanobis(r, residuals.R), limits.gate)
-        if far.any() and (far & far_from_the_others(r, predicted, residuals.R, limits.gate)).any():
-            return None
-    return _Judged(predicted, S, L, S_inv_r)
+        distances = mahalanobis(residuals.r[:, : axes.point], diagonal_blocks(S, axes.point))
+    return _Judged(predicted, S, L, S_inv_r, distances)
+
+
+def _may_be_something_else(residuals: _Residuals, judged: _Judged, gate: float) -> bool:
+    """Return whether some point is only so near to its landmark as the state is uncertain."""
+    R, r = residuals.R, residuals.r[:, : residuals.axes.point]
+    far = are_far(mahalanobis(r, R), gate)
+    return bool(far.any() and (far & far_from_the_others(r, judged.predicted, R, gate)).any())
 
 
 def _learnt(
     factors: Factors, residuals: _Residuals, S: FloatArray, gate: float
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return F̄ (2, 2) and θ (2,) by these residuals, too; None if some are to be left out."""
-    axes, r = residuals.axes, residuals.r
-    C = axes.output_matrix(residuals.points + 0.5 * r).reshape(-1, axes.p)
+    """Return F̄ (2, 2) and θ (2,) by these residuals, too; None if S is indefinite."""
+    axes, k = residuals.axes, residuals.axes.point
+    C = axes.output_matrix(residuals.points + 0.5 * residuals.r).reshape(-1, axes.p)
     # As the likelihood at θ has it, which may be less than is applied.
     ratios = np.exp(factors.logs) / factors.applied
     N = ratios[:, None, None] * factors.shares
     if np.count_nonzero(ratios != 1.0):
         S = S + C.dot((N - factors.shares).sum(axis=0)).dot(C.T)
-    L, is_indefinite = dpotrf(S, lower=1)
-    if is_indefinite:
-        return None
-    solved = dpotrs(L, np.column_stack([residuals.flat, C]), lower=1)[0]
-    squared = float(residuals.flat.dot(solved[:, 0]))
-    if squared > gate**2:
-        passed = np.count_nonzero(
-            mahalanobis(r[:, : axes.point], diagonal_blocks(S, axes.point)) <= gate
-        )
-        if len(r) < 2 * passed < 2 * len(r):
+    r = residuals.flat
+    while True:
+        L, is_indefinite = dpotrf(S, lower=1)
+        if is_indefinite:
             return None
+        solved = dpotrs(L, np.column_stack([r, C]), lower=1)[0]
+        squared, m = float(r.dot(solved[:, 0])), len(r) // k
+        if squared <= gate**2:
+            break
+        passed = mahalanobis(r.reshape(m, k), diagonal_blocks(S, k)) <= gate
+        if not m < 2 * np.count_nonzero(passed) < 2 * m:
+            break
+        used = np.flatnonzero(np.repeat(passed, k))  # some few are left out
+        S, C, r = S[np.ix_(used, used)], C[used], r[used]
     u, G = C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:])
     return learnt(factors.logs, factors.information, *score(u, G, N, squared, len(solved)))
+
+
+def _take_over(factors: Factors | None, learnt: tuple[FloatArray, FloatArray] | None) -> None:
+    if factors is None or learnt is None:
+        return
+    factors.information[:], factors.logs[:] = learnt
+    if factors.least < math.inf:
+        factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
 
 
 def _weights(residuals: _Residuals, judged: _Judged, limits: Limits) -> FloatArray | None:
@@ -459,7 +493,7 @@ def _write_judged(residuals: _Residuals, judged: _Judged, out: FloatArray) -> No
 
 def _record(x: Estimate, landmarks: Landmarks, seen: Seen, limits: Limits, out: Observed) -> None:
     """Note that landmarks were seen, and where they should have been by the corrected state."""
-    rows = out.rows
+    rows = seen.rows
     landmarks.counts[rows] += 1
     landmarks.rejections[rows] = 0
     last_ns = landmarks.last_seen_ns.take(rows)

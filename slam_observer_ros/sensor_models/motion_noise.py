@@ -116,25 +116,20 @@ class MotionNoise:
 
     def covariances(self, held: HeldVelocities) -> FloatArray:
         """Return what k motions may be off by: (k, 6, 6), rad² and m²."""
-        dt_s, some_are_stated = held.dt_s[:, None], np.count_nonzero(held.is_stated)
+        some_are_stated = np.count_nonzero(held.is_stated)
         variances = motion_variances(
             held.body_velocities, held.dt_s, held.before_s, held.usual_s, self.figures
         )
-        factors = self.factors.applied.repeat(3)
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         # In a gap the robot may do anything that is allowed.
         if np.count_nonzero(held.gap_s):
             variances += np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
         covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
-        # A stated covariance is that of one error for as long as the velocity is held, and of
-        # another in the next message: held for t it has moved the robot by t times the error,
-        # however many motions that was cut into. Of angular and linear part one may have none.
-        if some_are_stated:
-            squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
-            grown_s = np.repeat(np.sqrt(squared), 3, axis=1) * np.sqrt(factors)
-            stated = limited(held.covariances, MAX_SPEED_ERRORS)
-            covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
+        if some_are_stated:  # of angular and linear part one may have none
+            covariances += stated_motion_covariances(
+                held.covariances, held.dt_s, held.before_s, self.factors.applied
+            )
         return covariances
 
     @property
@@ -184,6 +179,22 @@ def motion_variances(
     if np.count_nonzero(figures.scales):
         variances += (figures.scales * averaged(V, dt_s, SPEED_WINDOW_S)) ** 2 * dt_s[:, None]
     grown: FloatArray = variances * figures.factors.repeat(3)
+    return grown
+
+
+def stated_motion_covariances(
+    covariances: FloatArray, dt_s: FloatArray, before_s: FloatArray, factors: FloatArray
+) -> FloatArray:
+    """Return those (k, 6, 6) of what velocities with stated ones (k, 6, 6) move by.
+
+    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), seconds. What is stated is of one
+    error for as long as the velocity is held, and of another in the next message: held for t it
+    has moved the robot by t times the error, however many motions that was cut into.
+    """
+    squared = dt_s[:, None] * (2.0 * before_s + dt_s[:, None])  # (before + dt)² − before²
+    grown_s = np.repeat(np.sqrt(squared * factors), 3, axis=1)
+    stated = limited(covariances, MAX_SPEED_ERRORS)
+    grown: FloatArray = grown_s[:, :, None] * stated * grown_s[:, None, :]
     return grown
 
 

@@ -37,6 +37,7 @@ class Velocities(NamedTuple):
     body_velocities: FloatArray  # (r, 6)
     since_ns: IntArray  # (r, 2) stamps of the messages that they are of
     is_stated: BoolArray  # (r, 2) whether a message stated its covariance
+    covariances: FloatArray  # (r, 6, 6) as stated, zero where unknown
     usual_angular_s: float  # how long one is held as a rule
     usual_linear_s: float
     timeout_ns: int  # how long one is held at most
@@ -212,6 +213,7 @@ class VelocityHistory:
             joined.body_velocities[:count],
             joined.since_ns[:count],
             joined.is_stated[:count],
+            joined.covariances[:count],
             usual_angular_s,
             usual_linear_s,
             self._timeout_ns,

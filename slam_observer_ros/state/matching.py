@@ -82,6 +82,17 @@ def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, Int
     return event.select(is_known), rows[is_known]
 
 
+def enter(state: State, event: ObservationEvent, noise: FloatArray) -> None:
+    """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
+    limit, new = state.settings.max_landmarks, len(event.ids)
+    m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
+    state.counts['unmapped_landmark'] += new - m
+    if m:
+        event = corrected_again(state, event.select(np.arange(new) < m))
+        state.gains.add(SeenPoints(event.points, noise[:m], sensitivity(state, event)))
+        state.landmarks.add(event.ids, event.stamp_ns)
+
+
 def residuals_of(
     state: State, event: ObservationEvent, rows: IntArray, covariances: FloatArray
 ) -> Residuals:

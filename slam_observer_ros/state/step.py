@@ -10,6 +10,7 @@ from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
     corrected_again,
+    enter,
     is_contradiction,
     keyframe_of,
     mapped,
@@ -99,19 +100,8 @@ def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEven
         return event, rows
     is_new = rows < 0
     state.forget(_rows_to_forget(state, matched), 'forgotten_landmark')
-    _initialise(state, event.select(is_new), matched.covariances[is_new])
+    enter(state, event.select(is_new), matched.covariances[is_new])
     return mapped(state, event)
-
-
-def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> None:
-    """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
-    limit, new = state.settings.max_landmarks, len(event.ids)
-    m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
-    state.counts['unmapped_landmark'] += new - m
-    if m:
-        event = corrected_again(state, event.select(np.arange(new) < m))
-        state.gains.add(SeenPoints(event.points, noise[:m], sensitivity(state, event)))
-        state.landmarks.add(event.ids, event.stamp_ns)
 
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:

@@ -6,6 +6,7 @@ Both return None, with nothing changed, where anything is unusual: see :mod:`.ob
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,12 +28,21 @@ from slam_observer_ros.observer.flat_arrays import (
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.riccati import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
+from slam_observer_ros.sensor_models.motion_noise import Factors
 from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.covariances import of_pose
 from slam_observer_ros.state.state import State
 
-_NO_ENTRIES, _NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
+_NO_ENTRIES, NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
+
+
+class Weighed(NamedTuple):
+    """Residuals of q points, and what was expected of them: metres, reference frame."""
+
+    r: FloatArray  # (q, k)
+    S: FloatArray  # (q k, q k) their covariance
+    R: FloatArray  # (q, k, k) what of it is that of the points
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +54,7 @@ class Outcome:
     rejected: BoolArray  # (m,) which of them were too far off to be used
     moved_ids: IntArray  # ids of landmarks that it showed to have moved
     innovation: NormalisedInnovation | None = None
+    weighed: Weighed | None = None  # of those that were used, if it was asked for
 
 
 def advance(
@@ -116,18 +127,73 @@ def _in_world(
     return observer.reference_pose @ A, of_pose(observer, covariance, A)
 
 
-def observe(state: State, event: ObservationEvent) -> Outcome | None:
-    """Let a state use an observation (28)–(31) made at its instant."""
-    if not 0 < len(event.ids) <= AT_ONCE or not len(state.landmarks.ids):
+class Corrected(NamedTuple):
+    """What the kernel made of points of known landmarks."""
+
+    status: int  # DONE, or REJECTS: then nothing has changed
+    seen: Seen
+    out: Observed
+    factors: Factors | None  # what was learnt of the noise of the motion
+
+
+def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
+    """Let a state use an observation (28)–(31) made at its instant.
+
+    ``is_weighed`` asks what was expected of it, too.
+    """
+    rows = state.landmarks.rows_of(event.ids)
+    if np.count_nonzero(rows < 0) or not takes(state, event):
         return None
-    x, seen = _estimate(state), _seen(state, event)
-    if x is None or seen is None:
+    corrected = correct(state, event, rows, is_weighed)
+    if corrected is None or corrected.status != step.DONE:
         return None
+    past, out, m = state.relinearisation, corrected.out, len(rows)
+    if past is not None and past.is_active:
+        past.add(keyframe(state, event, corrected), in_doubt=False)
+    return Outcome(
+        event.ids,
+        out.r,
+        np.zeros(m, dtype=np.bool_),
+        NO_IDS,
+        innovation(state, out),
+        weighed(state, out),
+    )
+
+
+def takes(state: State, event: ObservationEvent) -> bool:
+    """Return whether a state is a map of points at rest, and an observation of points alone.
+
+    Made at the state's instant, by a sensor that is known.
+    """
+    calibration = state.calibration
+    return (
+        event.velocities is None
+        and event.orientations is None
+        and event.sensed is None  # late, and carried forward
+        and not (calibration.corrects_points and event.sensor_frame not in calibration.sensors)
+        and _estimate(state) is not None
+    )
+
+
+def correct(
+    state: State,
+    event: ObservationEvent,
+    rows: IntArray,
+    is_weighed: bool = False,
+    of_all: Corrected | None = None,
+) -> Corrected | None:
+    """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe of it.
+
+    Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
+    """
+    m, k, x = len(rows), state.axes.point, _estimate(state)
+    if x is None or not 0 < m <= AT_ONCE:
+        return None
+    seen = _seen(state, event, rows)
     settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
-    m, factors = len(event.ids), noise.flat()
+    factors = noise.flat() if of_all is None else None
     out = Observed(
         np.empty((4, 4)),
-        np.empty(m, dtype=np.int64),
         np.empty((m, 3)),
         np.empty((m, 3)),
         np.empty(m),
@@ -137,6 +203,7 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
         np.empty(m),
         np.empty(x.first - state.axes.p),
         np.empty(3 * m + 1) if state.judges_innovations else _NO_ENTRIES,
+        np.empty(m * (m + 1) * k * k) if is_weighed else _NO_ENTRIES,
     )
     limits = Limits(
         settings.rejection_threshold,
@@ -146,25 +213,20 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
         settings.max_rejections,
         settings.max_hypotheses > 1,
     )
-    landmarks = Landmarks(
-        table._sorted_ids,
-        table._order,
-        table.counts,
-        table.rejections,
-        table.last_seen_ns,
-        table.seen_before_ns,
-    )
+    landmarks = Landmarks(table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns)
     figures = state.observation_noise.figures
-    if core.observe(x, landmarks, seen, figures, limits, factors, out) == step.UNUSUAL:
+    status = core.observe(x, landmarks, seen, figures, limits, factors, out)
+    if status == step.UNUSUAL:
         return None
-    noise.take(factors)
-    before = x.A.copy()
-    x.A[...] = out.A
-    if len(out.shift):
-        state.calibration.shift(out.shift)
-    state.rejected_in_a_row, state.was_contradicted = 0, False
-    _record(state, event, seen, before, out)
-    return Outcome(event.ids, out.r, np.zeros(m, dtype=np.bool_), _NO_IDS, _innovation(state, out))
+    if status == step.DONE:
+        noise.take(factors if of_all is None else of_all.factors)
+        if state.relinearisation is not None:
+            state.relinearisation.note_correction(x.A, out.A)
+        x.A[...] = out.A
+        if len(out.shift):
+            state.calibration.shift(out.shift)
+        state.rejected_in_a_row, state.was_contradicted = 0, False
+    return Corrected(status, seen, out, factors)
 
 
 def _estimate(state: State) -> Estimate | None:
@@ -224,20 +286,14 @@ def _advanced(
     return core.advance(x, velocities, interval, state.motion_noise.figures, out), out
 
 
-def _seen(state: State, event: ObservationEvent) -> Seen | None:
-    """Return points, and what of their sensor is calibrated; None where there is more to them."""
-    if event.velocities is not None or event.orientations is not None:
-        return None
-    if event.sensed is not None:  # late, and carried forward
-        return None
+def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
+    """Return points of known landmarks, and what of their sensor is calibrated."""
     arms, covariances = _plain(event.lines_of_sight), event.covariances
-    ids, origins = np.ascontiguousarray(event.ids, np.int64), event.sensor
+    origins = event.sensor
     calibration = state.calibration
-    values, estimated, column = None, _NO_IDS, 0
+    values, estimated, column = None, NO_IDS, 0
     if calibration.corrects_points:
-        sensor = calibration.sensors.get(event.sensor_frame)
-        if sensor is None:  # seen for the first time
-            return None
+        sensor = calibration.sensors[event.sensor_frame]
         values, estimated = sensor.values, sensor.estimated
         column = calibration.columns(sensor).start
     if state.settings.range_is_depth:
@@ -247,7 +303,7 @@ def _seen(state: State, event: ObservationEvent) -> Seen | None:
             covariances = covariances / cosines[:, None, None] ** 2
     return Seen(
         event.stamp_ns,
-        ids,
+        rows,
         arms,
         None if origins is None else _plain(origins),
         None if covariances is None else _plain(covariances),
@@ -262,35 +318,35 @@ def _plain(array: FloatArray) -> FloatArray:
     return np.ascontiguousarray(array, np.float64)
 
 
-def _record(
-    state: State, event: ObservationEvent, seen: Seen, before: FloatArray, out: Observed
-) -> None:
-    """Keep an observation to be linearised again, if it is."""
-    past = state.relinearisation
-    if past is None:
-        return
-    past.note_correction(before, out.A)
-    if not past.is_active:
-        return
-    sensed = None
+def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Keyframe:
+    """Return what is needed to linearise again what was seen."""
+    seen, out, sensed = corrected.seen, corrected.out, None
     if seen.sensor is not None:
         number = state.calibration.sensors[event.sensor_frame].number
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
     stated = out.covariances if len(out.covariances) else None
-    keyframe = Keyframe(
-        event.stamp_ns, out.rows, out.points, out.lines_of_sight, stated, out.dt_s, None, sensed
+    return Keyframe(
+        event.stamp_ns, seen.rows, out.points, out.lines_of_sight, stated, out.dt_s, None, sensed
     )
-    past.add(keyframe, in_doubt=False)
 
 
-def _innovation(state: State, out: Observed) -> NormalisedInnovation | None:
+def innovation(state: State, out: Observed) -> NormalisedInnovation | None:
     """Return how far off the residuals were, if that was asked for."""
     if not len(out.judged):
         return None
-    m = len(out.rows)
+    m = len(out.weights)
     distances, densities, shares = out.judged[:-1].reshape(3, m)
     nis = float(out.judged[-1])
     return NormalisedInnovation(
         distances, out.weights, nis, m * state.axes.point, densities, shares
     )
+
+
+def weighed(state: State, out: Observed) -> Weighed | None:
+    """Return what was expected of the residuals, if that was asked for."""
+    if not len(out.expected):
+        return None
+    m, k = len(out.r), state.axes.point
+    S, R = out.expected[: (m * k) ** 2], out.expected[(m * k) ** 2 :]
+    return Weighed(out.r[:, :k], S.reshape(m * k, m * k), R.reshape(m, k, k))

@@ -58,9 +58,12 @@ def random_motion(rng):
     stamps_ns[0] = NEVER_NS
     since_ns = np.column_stack([stamps_ns - rng.integers(0, 10_000_000, r), stamps_ns])
     V = rng.standard_normal((r, 6)) * (rng.random((r, 1)) < 0.9)
-    is_stated = np.zeros((r, 2), dtype=np.bool_)
+    is_stated = (rng.random((r, 2)) < 0.5) & (rng.random() < 0.5)
+    stated = np.array([random_covariance(rng, 6, rng.choice([0.1, 100.0])) for _ in range(r)])
+    known = np.repeat(is_stated, 3, axis=1)
+    stated *= known[:, :, None] & known[:, None, :]
     usual_s = tuple(rng.choice([0.02, 0.1, np.inf], 2).tolist())
-    velocities = Velocities(stamps_ns, V, since_ns, is_stated, *usual_s, SECOND_NS)
+    velocities = Velocities(stamps_ns, V, since_ns, is_stated, stated, *usual_s, SECOND_NS)
     begin_ns = int(rng.integers(stamps_ns[1], stamps_ns[-1] + 1))
     end_ns = begin_ns + int(rng.integers(1, 500_000_000)) * int(rng.random() < 0.9)
     delay_ns = int(rng.integers(-50_000_000, 50_000_000))
@@ -86,22 +89,22 @@ def random_observation(rng):
     x = random_estimate(rng)
     n, p, k = len(x.a), 3 if x.is_planar else 6, 2 if x.is_planar else 3
     m = int(rng.integers(1, min(n, 8) + 1))
-    rows, ids = rng.permutation(n)[:m], rng.permutation(10 * n)[:n].astype(np.int64)
-    order = np.argsort(ids)
+    rows = rng.permutation(n)[:m]
     now_ns = START_NS
     last_ns = now_ns - rng.integers(0, 3, n) * SECOND_NS
     before_ns = np.where(rng.random(n) < 0.3, -1, last_ns - SECOND_NS)
     counts, rejections = rng.integers(1, 9, n), rng.integers(0, 2, n) * rng.integers(0, 2)
-    landmarks = Landmarks(ids[order], order, counts, rejections, last_ns, before_ns)
+    landmarks = Landmarks(counts, rejections, last_ns, before_ns)
     expected = (x.y_ref[rows] + x.a[rows] - x.A[:3, 3]) @ x.A[:3, :3]
     points = expected + 0.1 * rng.standard_normal((m, 3)) * (1.0, 1.0, 1.0 - x.is_planar)
+    points[0, :2] += 20.0 * (rng.random() < 0.15)  # one that is rejected
     origins = 0.2 * rng.standard_normal((m, 3)) if rng.integers(2) else None
     c_v = len(x.estimated)
     c_s = len(x.drift) - c_v
     is_calibrated = bool(rng.integers(2))
     seen = Seen(
         now_ns,
-        ids[rows] if rng.random() < 0.95 else ids[rows] + 1,
+        rows,
         points if origins is None else points - origins,
         origins,
         np.array([random_covariance(rng, 3, rng.choice([0.0, 0.1])) for _ in rows])
@@ -120,12 +123,12 @@ def random_observation(rng):
         factors = Factors(shares, logs, information, np.exp(np.maximum(logs, 0.0)), 0.0)
     out = Observed(
         np.zeros((4, 4)),
-        np.zeros(m, dtype=np.int64),
         *(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3))),
         np.zeros((0 if seen.covariances is None else m, 3, 3)),
         np.zeros(m),
         np.zeros(x.first - p),
         np.zeros(int(rng.choice([0, 3 * m + 1]))),
+        np.zeros(int(rng.choice([0, m * (m + 1) * k * k]))),
     )
     figures = PointFigures(*rng.uniform(1e-4, 1e-2, 5).tolist())
     assert x.size == x.first + k * n

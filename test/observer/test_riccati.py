@@ -24,6 +24,7 @@ from strategies import generators, poses
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati import riccati as riccati_module
@@ -462,12 +463,12 @@ def test_what_relinearising_failed_for_is_relinearised_later(monkeypatch):
 @given(generators())
 def test_many_points_in_blocks_leave_what_all_at_once_would(settings, is_exact, rng):
     filters = [started(np.random.default_rng(0), settings, n=12) for _ in range(2)]
-    points = filters[0].points + 0.1 * rng.standard_normal((12, 3))
+    points = filters[0].observer.points + 0.1 * rng.standard_normal((12, 3))
     if is_exact:
         for each in filters:
-            each.fix_landmarks(points, np.zeros((12, 3, 3)))
+            each.fix_landmarks(KnownLandmarks(points, np.zeros((12, 3, 3))))
     rows = rng.permutation(12)
-    seen = filters[0].expected_points(rows) + 0.1 * rng.standard_normal((12, 3))
+    seen = filters[0].observer.body_points(rows) + 0.1 * rng.standard_normal((12, 3))
     R, all_at_once = 0.01 * random_covariances(rng, 12, 3), riccati_module.AT_ONCE
     for each, at_once in zip(filters, (all_at_once, 5), strict=True):
         with pytest.MonkeyPatch.context() as patch:
@@ -475,7 +476,7 @@ def test_many_points_in_blocks_leave_what_all_at_once_would(settings, is_exact, 
             observe(each, rows, seen, R)
     one, other = filters
     np.testing.assert_allclose(other.observer.A, one.observer.A, rtol=0.0, atol=3e-14)
-    np.testing.assert_allclose(other.points, one.points, rtol=0.0, atol=3e-14)
+    np.testing.assert_allclose(other.observer.points, one.observer.points, rtol=0.0, atol=3e-14)
     np.testing.assert_allclose(other.calibration.values, one.calibration.values, atol=3e-14)
     P = one.joint.P
     np.testing.assert_allclose(other.joint.P, P, rtol=0.0, atol=3e-14 * np.abs(P).max())
