@@ -302,7 +302,7 @@ def test_a_landmark_that_is_relocated_is_as_new_and_the_others_stay(rng):
 
 def test_in_an_exact_map_nothing_is_known_of_pose_and_landmarks_together():
     riccati = RiccatiGains(PLAIN, np.eye(4))
-    riccati.fix_landmarks(np.eye(3), np.tile(0.01 * np.eye(3), (3, 1, 1)))
+    riccati.fix_landmarks(KnownLandmarks(np.eye(3), np.tile(0.01 * np.eye(3), (3, 1, 1))))
     assert riccati.joint_covariance(np.arange(3)) is None
 
 
