@@ -229,7 +229,7 @@ def test_observations_never_determine_where_the_worlds_frame_is(rng):
     sure, unsure = run(np.zeros((6, 6))), run(unsure_of_frame)
     np.testing.assert_allclose(unsure.observer.A, sure.observer.A, atol=1e-9)
     np.testing.assert_allclose(unsure.observer.a, sure.observer.a, atol=1e-8)
-    gauge = np.vstack([np.eye(6), SPATIAL.output_matrix(sure.points).reshape(-1, 6)])
+    gauge = np.vstack([np.eye(6), SPATIAL.output_matrix(sure.observer.points).reshape(-1, 6)])
     expected = covariance_of_all(sure) + gauge @ unsure_of_frame @ gauge.T
     np.testing.assert_allclose(covariance_of_all(unsure), expected, rtol=1e-9, atol=1e-9)
 
@@ -297,7 +297,9 @@ def test_a_landmark_that_is_relocated_is_as_new_and_the_others_stay(rng):
     np.testing.assert_allclose(
         covariance_of_all(relocated), added.joint_covariance(order), atol=1e-12
     )
-    np.testing.assert_array_equal(relocated.pose_covariance(), added.pose_covariance())
+    np.testing.assert_array_equal(
+        relocated.errors.pose_covariance(), added.errors.pose_covariance()
+    )
 
 
 def test_in_an_exact_map_nothing_is_known_of_pose_and_landmarks_together():

@@ -269,7 +269,7 @@ def test_a_landmark_that_is_relocated_is_as_uncertain_as_a_new_one():
     point, R = rng.normal(size=(1, 3)), random_covariances(rng, 1, 3)
     relocated.relocate(np.array([1]), SeenPoints(point, R))
     added.add(SeenPoints(point, R))
-    np.testing.assert_allclose(relocated.points[1], added.points[n], atol=1e-12)
+    np.testing.assert_allclose(relocated.observer.points[1], added.observer.points[n], atol=1e-12)
     of_one = np.append(np.arange(6), np.arange(9, 12))
     of_last = np.append(np.arange(6), 6 + 3 * n + np.arange(3))
     np.testing.assert_allclose(

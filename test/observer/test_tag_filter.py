@@ -82,7 +82,7 @@ def test_orientations_that_are_never_seen_leave_the_filter_of_points(rng):
     points, tags = run(RiccatiGains(PLAIN, np.eye(4))), run(RiccatiGains(TAGS, np.eye(4)))
     rows = np.arange(4)
     np.testing.assert_allclose(tags.observer.A, points.observer.A, atol=1e-12)
-    np.testing.assert_allclose(tags.observer.points, points.points, atol=1e-11)
+    np.testing.assert_allclose(tags.observer.points, points.observer.points, atol=1e-11)
     np.testing.assert_allclose(
         tags.joint_covariance(rows), points.joint_covariance(rows), atol=1e-11
     )
