@@ -89,10 +89,10 @@ $(READY_TO_DEVELOP): $(READY) requirements-develop.lock
 	touch $@
 
 # Where there is a compiler; it was built with the rest at first, and is again when it changes.
-$(CORE): $(wildcard slam_observer_ros/observer/_*.[ch]) | $(READY)
+$(CORE): $(wildcard slam_observer_ros/*/_*.[ch]) | $(READY)
 	$(PYTHON_IN_VENV) setup.py --quiet build_ext --inplace
 	touch $@
 
 clean:  ## remove all that make made, but demo_output
-	rm -rf $(VENV) build install log site *.egg-info .hypothesis slam_observer_ros/observer/*.so
+	rm -rf $(VENV) build install log site *.egg-info .hypothesis slam_observer_ros/*/*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -38,12 +38,13 @@ setup(
     ],
     ext_modules=[
         Extension(
-            f'{PACKAGE}.observer._core',
-            [f'{PACKAGE}/observer/_core.c'],
+            f'{PACKAGE}.{folder}.{name}',
+            [f'{PACKAGE}/{folder}/{name}.c'],
             depends=glob(f'{PACKAGE}/observer/_*.h'),
             extra_compile_args=['-O3', '-fno-math-errno'],
             optional=True,  # without a compiler numpy does the same
         )
+        for folder, name in (('observer', '_core'), ('smoothing', '_gauss_newton'))
     ],
     zip_safe=False,
     python_requires='>=3.10',

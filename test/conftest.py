@@ -14,6 +14,7 @@ import tempfile
 import time
 from typing import TYPE_CHECKING
 
+from command_line import CommandLine
 from hypothesis import settings
 import pytest
 
@@ -97,6 +98,12 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f'no recordings in {path}: SLAM_OBSERVER_DATA names their folder')
     return path
+
+
+@pytest.fixture
+def slam_observer(capsys: pytest.CaptureFixture[str]) -> CommandLine:
+    """Run ``slam-observer`` in the test's process."""
+    return CommandLine(capsys)
 
 
 @pytest.fixture(scope='module', autouse=True)

@@ -159,6 +159,8 @@ class Hypotheses:
         from that of the first. Coordinates are those of :meth:`.State.pose_after`.
         """
         pose, own = of_each[0]
+        if len(of_each) == 1:  # as nearly always
+            return own
         likelihoods = np.exp(-0.5 * np.array([hypothesis.cost for hypothesis in self._all]))
         weights, total = likelihoods / likelihoods.sum(), own
         for (other, covariance), weight in zip(of_each[1:], weights[1:].tolist(), strict=True):

@@ -366,7 +366,8 @@ class Estimator:
     @property
     def pose(self) -> FloatArray:
         """(4, 4) estimated pose at ``stamp_ns``, body to world."""
-        return self.pose_at(self.stamp_ns or 0)
+        leads_on = self._timeline.lead_s > 0.0
+        return self.uncertain_pose[0] if leads_on else self._state.observer.pose
 
     def pose_at(self, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) at any time: the state, moved on by the velocities since."""
@@ -403,9 +404,15 @@ class Estimator:
         Along the world's axes; it includes that the most likely hypothesis may be wrong. None
         where the filter knows no covariance.
         """
+        return self.uncertain_pose[1]
+
+    @property
+    def uncertain_pose(self) -> tuple[FloatArray, FloatArray | None]:
+        """:attr:`pose` and :attr:`pose_covariance`, both for what one of them costs."""
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        return self._hypotheses.pose_after(timeline.velocities, start_ns, end_ns)[1]
+        pose, covariance = self._hypotheses.pose_after(timeline.velocities, start_ns, end_ns)
+        return pose if end_ns > start_ns else self._state.observer.pose, covariance
 
     @property
     def body_velocity(self) -> FloatArray:
@@ -424,10 +431,10 @@ class Estimator:
             return None
         state, axes = self._state, self._state.axes
         measured = state.motion_noise.velocity_covariance(held)
+        if axes.p < len(measured):
+            measured = axes.full_pose_covariance(measured[axes.pose, axes.pose])
         return state.calibration.apply_to_covariance(
-            axes.full_pose_covariance(measured[axes.pose, axes.pose]),
-            held.body_velocities[0],
-            state.gains.calibration_variances,
+            measured, held.body_velocities[0], state.gains.calibration_variances
         )
 
     @property
@@ -681,7 +688,7 @@ class Estimator:
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
-        is_dense = state.errors is not None and state.errors.joint.is_dense
+        is_dense = state.joint is not None and state.joint.is_dense
         warnings.large_map(len(state.landmarks), limit, is_dense)
         distance_m = np.abs(state.observer.A[:3, 3]).max()
         if not distance_m <= DIVERGED_M:  # nor is what is no number

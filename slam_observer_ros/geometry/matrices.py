@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 import numpy as np
-from scipy.linalg.lapack import dgesv, dposv
+from scipy.linalg.lapack import dgesv, dposv, dpotrf, dpotri
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 
@@ -78,6 +78,23 @@ def solve_definite(S: FloatArray, right: FloatArray) -> FloatArray:
         return solve(S, right)  # what rounding has made indefinite, too
     except np.linalg.LinAlgError:
         return solve(definite(S), right)
+
+
+def definite_inverse(S: FloatArray) -> FloatArray:
+    """Return S⁻¹ of a symmetric, positive definite S (q, q), at half of what `inv` takes."""
+    if 0 < len(S) <= VERY_LARGE:
+        L, is_indefinite = dpotrf(S, lower=1)
+        if not is_indefinite:
+            return inverse_by_factor(L)
+    return np.asarray(np.linalg.inv(S), dtype=np.float64)  # what rounding has made indefinite, too
+
+
+def inverse_by_factor(L: FloatArray) -> FloatArray:
+    """Return (L Lᵀ)⁻¹ of a lower triangular L (q, q)."""
+    half, _ = dpotri(L, lower=1)
+    whole: FloatArray = np.tril(half)
+    whole += np.tril(whole, -1).T
+    return whole
 
 
 def cholesky(S: FloatArray) -> FloatArray:

@@ -94,8 +94,8 @@ def joint_covariance(
     the gains know no joint covariance.
     """
     m, axes, points = len(rows), state.axes, state.observer.points[rows]
-    errors = state.errors
-    P = None if errors is None else errors.joint.of_landmarks(rows, points, tags)
+    joint = state.joint
+    P = None if joint is None else joint.of_landmarks(rows, points, tags)
     if P is None or m == 0:
         return P
     # As the square of a root, so that rounding makes no variance negative, however small it is.

@@ -148,7 +148,7 @@ class ObserverCore:
     def _is_finite(self) -> bool:
         estimator = self._flow.estimator
         try:
-            known = (estimator.pose, estimator.pose_covariance, estimator.world_points)
+            known = (*estimator.uncertain_pose, estimator.world_points)
         except (ArithmeticError, np.linalg.LinAlgError):
             return False
         return all(each is None or bool(np.isfinite(each).all()) for each in known)

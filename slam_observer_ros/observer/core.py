@@ -2,27 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 import os
-from types import ModuleType
 
+from slam_observer_ros.common.compiled import compiled, VARIABLE
 from slam_observer_ros.observer import step
 
-VARIABLE = 'SLAM_OBSERVER_CORE'
-"""Environment variable that chooses the reference where it is ``numpy``."""
-
-
-def _compiled() -> ModuleType | None:
-    """Return the compiled core; None where it was not built, or is not to be used."""
-    if os.environ.get(VARIABLE) == 'numpy':
-        return None
-    try:
-        return import_module('slam_observer_ros.observer._core')
-    except ImportError:  # there was no compiler
-        return None
-
-
-COMPILED = _compiled()
+COMPILED = compiled('observer._core')
 
 
 def description() -> str:

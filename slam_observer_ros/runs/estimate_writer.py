@@ -121,8 +121,8 @@ class EstimateWriter:
             self._write(ALIGNED_LANDMARKS_TOPIC, cloud, first_ns, latched=True)
 
     def _write_state(self, estimator: Estimator, stamp_ns: int) -> None:
-        pose = estimator.pose
-        uncertain = uncertain_pose(pose, estimator.pose_covariance)
+        pose, covariance = estimator.uncertain_pose
+        uncertain = uncertain_pose(pose, covariance)
         message = self._state.pose(stamp_ns, uncertain)
         self._writer.write('/pose', POSE, message, stamp_ns, latched=True)
         velocity = estimator.body_velocity, estimator.body_velocity_covariance

@@ -218,11 +218,14 @@ class Calibration:
 
         ``variances`` (c,) are what the filter knows of the estimates.
         """
-        of_all = np.zeros(len(NAMES))
-        of_all[self._estimated] = variances[: self.of_velocity]
-        of_velocity = of_all[:6] * body_velocity**2 + of_all[6:DELAY] * _moves(body_velocity)
         scales = self._all[:6]
-        return scales[:, None] * covariance * scales + np.diag(of_velocity)
+        applied = scales[:, None] * covariance * scales
+        if self.of_velocity:
+            of_all = np.zeros(len(NAMES))
+            of_all[self._estimated] = variances[: self.of_velocity]
+            of_velocity = of_all[:6] * body_velocity**2 + of_all[6:DELAY] * _moves(body_velocity)
+            applied.ravel()[::7] += of_velocity
+        return applied
 
     def sensitivity(
         self,

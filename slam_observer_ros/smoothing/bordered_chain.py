@@ -15,8 +15,9 @@ the border is small.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
+from types import ModuleType
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky_banded
@@ -24,8 +25,11 @@ from scipy.linalg.blas import dtbsv
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csc_array
 
+from slam_observer_ros.common.compiled import compiled
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.geometry.matrices import inverse_by_factor, transpose
+
+COMPILED = compiled('smoothing._gauss_newton')
 
 STRIDE = 8
 
@@ -33,8 +37,7 @@ SMALL_BORDER = 100
 """Size of a border which, carried along the whole chain, costs less than a detour."""
 
 
-@dataclass(frozen=True, slots=True)
-class Equations:
+class Equations(NamedTuple):
     """The normal equations, block by block, of S poses and a border of b unknowns."""
 
     diagonal: FloatArray  # (S, d, d) blocks of T
@@ -49,39 +52,95 @@ class Equations:
     border_gradient: FloatArray  # (b,) h
 
 
+class Elimination(Protocol):
+    """What is left of the equations once the chain of poses is eliminated, T = Uᵀ U."""
+
+    corner: FloatArray  # (b, b) D − Bᵀ T⁻¹ B
+    border_gradient: FloatArray  # (b,) h − Bᵀ T⁻¹ g
+    last_root: FloatArray  # (d, d) U⁻¹ of the last pose
+    last_rows: FloatArray  # (d, b) of U⁻ᵀ B those of the last pose
+
+    def fill_in(self, border: FloatArray) -> FloatArray:
+        """Return the changes (S, d) of the poses from those (b,) of the border."""
+
+
 class Factors:
     """Factors of the normal equations; LinAlgError is raised if these are singular."""
 
     def __init__(self, equations: Equations) -> None:
-        self._stretches = _Stretches(equations)
-        diagonal, above, rows = self._stretches.kept_chain(equations)
-        corner, self._border_gradient = self._stretches.border(equations)
-        self._d = rows.shape[2]
-        self._chain = np.asfortranarray(cholesky_banded(_banded(diagonal, above)))
-        rows = _forward(self._chain, rows.reshape(len(rows), -1))
-        self._border, self._gradient = rows[:-1], rows[-1]
-        self._corner = cho_factor(corner - self._border @ self._border.T)
+        self._chain: Elimination = (
+            _InNumpy(equations) if COMPILED is None else _Compiled(COMPILED, equations)
+        )
+        # Symmetric: transposed it is laid out as LAPACK has it.
+        self._corner, _ = cho_factor(self._chain.corner.T, lower=True, overwrite_a=True)
 
     def solve(self) -> tuple[FloatArray, FloatArray]:
         """Return the changes (S, d) of the poses and (b,) of the border."""
-        open_gradient = self._border_gradient - self._border @ self._gradient
-        border: FloatArray = -cho_solve(self._corner, open_gradient)
-        bandwidth = len(self._chain) - 1
-        kept = -dtbsv(bandwidth, self._chain, self._gradient + border @ self._border)
-        return self._stretches.fill_in(kept.reshape(-1, self._d), border), border
+        border: FloatArray = -cho_solve((self._corner, True), self._chain.border_gradient)
+        return self._chain.fill_in(border), border
 
     def marginal(self) -> FloatArray:
         """Return the covariance (d + b, d + b) of the last pose and the border."""
-        d, b = self._d, len(self._border)
-        corner = cho_solve(self._corner, np.eye(b))
-        root = _forward(self._chain[:, -d:], np.eye(d))  # U⁻¹ of the last pose
-        tail = root @ self._border[:, -d:].T
+        root = self._chain.last_root
+        d, b = self._chain.last_rows.shape
+        corner = inverse_by_factor(self._corner)
+        tail = root @ self._chain.last_rows
         covariance = np.empty((d + b, d + b))
         covariance[:d, :d] = root @ root.T + tail @ corner @ tail.T
         covariance[:d, d:] = -tail @ corner
         covariance[d:, :d] = covariance[:d, d:].T
         covariance[d:, d:] = corner
         return covariance
+
+
+class _Compiled:
+    """The same by ``_gauss_newton.c``, which uses up the equations' border."""
+
+    def __init__(self, compiled: ModuleType, equations: Equations) -> None:
+        (S, d), b = equations.gradient.shape, len(equations.corner)
+        R = S - (STRIDE - 1) * _stretch_count(equations)
+        factors, rows = np.empty((R, d, d)), np.empty((R, d, b + 1))
+        self._compiled = compiled
+        self._equations = equations = Equations._make(map(np.ascontiguousarray, equations))
+        self._chain = factors, np.empty((R - 1, d, d)), rows
+        if not compiled.eliminate(equations, self._chain):
+            raise np.linalg.LinAlgError('some pose of the chain is open')
+        flat = rows.reshape(-1, b + 1)
+        lost = flat.T @ flat
+        self.corner, self.border_gradient = equations.corner, equations.border_gradient
+        self.corner -= lost[:b, :b]
+        self.border_gradient -= lost[:b, b]
+        self.last_root = np.linalg.inv(np.tril(factors[-1])).T
+        self.last_rows = rows[-1, :, :b]
+
+    def fill_in(self, border: FloatArray) -> FloatArray:
+        """Return the changes (S, d) of the poses from those (b,) of the border."""
+        changes = np.empty_like(self._equations.gradient)
+        self._compiled.fill_in(self._equations, self._chain, np.append(border, 1.0), changes)
+        return changes
+
+
+class _InNumpy:
+    """The same in numpy, the reference."""
+
+    def __init__(self, equations: Equations) -> None:
+        self._stretches = _Stretches(equations)
+        diagonal, above, rows = self._stretches.kept_chain(equations)
+        corner, border_gradient = self._stretches.border(equations)
+        self._d = d = rows.shape[2]
+        self._factor = np.asfortranarray(cholesky_banded(_banded(diagonal, above)))
+        rows = _forward(self._factor, rows.reshape(len(rows), -1))
+        self._border, self._gradient = rows[:-1], rows[-1]
+        self.corner = corner - self._border @ self._border.T
+        self.border_gradient = border_gradient - self._border @ self._gradient
+        self.last_root = _forward(self._factor[:, -d:], np.eye(d))
+        self.last_rows = self._border[:, -d:].T
+
+    def fill_in(self, border: FloatArray) -> FloatArray:
+        """Return the changes (S, d) of the poses from those (b,) of the border."""
+        bandwidth = len(self._factor) - 1
+        kept = -dtbsv(bandwidth, self._factor, self._gradient + border @ self._border)
+        return self._stretches.fill_in(kept.reshape(-1, self._d), border)
 
 
 class _Stretches:
@@ -93,8 +152,7 @@ class _Stretches:
 
     def __init__(self, equations: Equations) -> None:
         S, self._d = equations.gradient.shape
-        is_small = len(equations.corner) <= SMALL_BORDER
-        self._count = 0 if is_small else (S - 1) // STRIDE
+        self._count = _stretch_count(equations)
         self._inner = STRIDE * np.arange(self._count)[:, None] + np.arange(1, STRIDE)
         self._kept = np.setdiff1d(np.arange(S), self._inner)
         stretch, offset = np.divmod(equations.poses, STRIDE)
@@ -186,6 +244,12 @@ class _Stretches:
         changes[self._kept] = kept
         changes[self._inner] = -(self._solved @ ends[:, :, None]).reshape(J, STRIDE - 1, d)
         return changes
+
+
+def _stretch_count(equations: Equations) -> int:
+    """Return how many stretches of poses are eliminated before the others."""
+    is_small = len(equations.corner) <= SMALL_BORDER
+    return 0 if is_small else (len(equations.gradient) - 1) // STRIDE
 
 
 def landmark_columns(landmarks: IntArray, c: int, k: int) -> IntArray:

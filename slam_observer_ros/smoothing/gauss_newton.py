@@ -16,18 +16,30 @@ Outliers are reweighted in each iteration (Huber).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.axes import EstimatedAxes, PLANAR
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
+from slam_observer_ros.smoothing.bordered_chain import (
+    COMPILED,
+    Equations,
+    Factors,
+    landmark_columns,
+    sum_by,
+)
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
-from slam_observer_ros.smoothing.observations import normal, Observations, SensedPoints
+from slam_observer_ros.smoothing.observations import (
+    NO_SENSORS,
+    normal,
+    Observations,
+    SensedPoints,
+)
 from slam_observer_ros.smoothing.prior import inverse, Prior
 
 
@@ -64,6 +76,7 @@ class Smoother:
         self._axes = axes
         self._prior = prior
         self._keyframes = keyframes
+        self._settings, self._sensed = settings, sensed
         self._observations = Observations(axes, keyframes, settings, sensed)
         # Unknowns of a landmark: its position, then its turn if that is estimated.
         self._unknowns = axes.point + (axes.turn if keyframes.turns is not None else 0)
@@ -71,6 +84,7 @@ class Smoother:
         self._chained, self._shared = (c, 0) if drifts else (0, c)
         self._link_information = _link_information(keyframes, drifts)
         self._prior_information = inverse(prior.covariance)
+        self._is_usual = keyframes.turns is None and not drifts
 
     def smooth(
         self, start: Solution, iterations: int, tolerance: float, gated: bool = True
@@ -119,6 +133,8 @@ class Smoother:
         )
 
     def _linearise(self, solution: Solution, gated: bool = True) -> Equations:
+        if COMPILED is not None and self._is_usual:
+            return self._linearised_by(COMPILED, solution, gated)
         c, k, keyframes = self._shared, self._unknowns, self._keyframes
         S, b = len(solution.poses), c + k * len(solution.points)
         d = self._axes.p + self._chained
@@ -146,6 +162,37 @@ class Smoother:
             self._add_sensors(equations, H[:, end:], gradient[:, end:])
         self._add_prior(equations, solution)
         self._add_motions(equations, solution)
+        return equations
+
+    def _linearised_by(self, compiled: ModuleType, solution: Solution, gated: bool) -> Equations:
+        """Return the same by ``_gauss_newton.c``."""
+        c, k, d, keyframes = self._shared, self._unknowns, self._axes.p, self._keyframes
+        prior, links, settings = self._prior, keyframes.links, self._settings
+        S, M, b = len(solution.poses), len(keyframes.landmarks), c + k * len(solution.points)
+        equations = Equations(
+            diagonal=np.zeros((S, d, d)),
+            above=np.zeros((S - 1, d, d)),
+            shared=np.zeros((S, d, c)),
+            poses=keyframes.keyframes + 1,
+            landmarks=keyframes.landmarks,
+            seen=np.zeros((M, d, k)),
+            first=np.zeros((d, b)),
+            corner=np.zeros((b, b)),
+            gradient=np.zeros((S, d)),
+            border_gradient=np.zeros(b),
+        )
+        information, calibration = self._prior_information, solution.calibrations[0]
+        sensed = NO_SENSORS if self._sensed is None else self._sensed.flat(calibration)
+        gate = settings.rejection_threshold if gated else 0.0
+        parts = (
+            equations,
+            (prior.pose, prior.calibration, prior.points, information, prior.is_relative),
+            (links.motions, links.sensitivities, self._link_information, keyframes.calibrations),
+            (keyframes.points, keyframes.information, keyframes.shares, *sensed),
+            (solution.poses, calibration, solution.points),
+            (gate, settings.huber_threshold, d == PLANAR.p),
+        )
+        compiled.linearise(*(tuple(map(_contiguous, part)) for part in parts))
         return equations
 
     def _add_sensors(self, equations: Equations, H: FloatArray, gradient: FloatArray) -> None:
@@ -236,6 +283,11 @@ class Smoother:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""
         pose = self._axes.pose
         return matrices[:, pose, pose]
+
+
+def _contiguous(part: object) -> object:
+    """Return what C reads: an array may be a view of another one."""
+    return np.ascontiguousarray(part) if isinstance(part, np.ndarray) else part
 
 
 def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -27,9 +28,10 @@ from slam_observer_ros.smoothing.keyframes import (
 )
 from slam_observer_ros.smoothing.prior import Prior
 
+_Motion: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
-@dataclass(frozen=True, slots=True)
-class Keyframe:
+
+class Keyframe(NamedTuple):
     """All m landmarks of one observation, after the correction and with the new ones."""
 
     stamp_ns: int
@@ -60,8 +62,7 @@ def _all_sensed(seen: list[Keyframe]) -> Sensed | None:
     return joined_sensed(sensed) if sensed else None
 
 
-@dataclass(frozen=True, slots=True)
-class _Step:
+class _Step(NamedTuple):
     """A keyframe and the motion that led to it, the sum of those given to History.move."""
 
     start: FloatArray
@@ -79,7 +80,7 @@ class _Step:
         slip = self.slip
         if slip is None:
             return []
-        return [replace(self, end=slip.path[-1], noise=self.noise + slip.noise)]
+        return [self._replace(end=slip.path[-1], noise=self.noise + slip.noise)]
 
 
 class History:
@@ -103,7 +104,8 @@ class History:
         self._start: FloatArray | None = None
         self._end = prior.pose
         self._slip: Motion | None = None
-        self._motion_noise, self._sensitivity, self._drift = self._at_rest()
+        # Noise, sensitivity and drift of the motion since the last keyframe; None if at rest.
+        self._motion: _Motion | None = None
         # Keyframes as arrays: the summarised ones, in pieces, and the others.
         q = 0 if prior.orientations is None else axes.turn
         self._none = no_keyframes(axes.p, len(prior.calibration), axes.point, q)
@@ -138,9 +140,11 @@ class History:
     ) -> None:
         """Append a motion to a pose ``end`` (4, 4), with what :class:`.Motion` has of it."""
         self._end = end.copy()  # not a view, which would keep all of a path
-        self._motion_noise = self._motion_noise + noise
-        self._sensitivity = self._sensitivity + sensitivity
-        self._drift = self._drift + drift
+        before = self._motion
+        if before is None:
+            self._motion = noise.copy(), sensitivity.copy(), drift.copy()
+        else:
+            self._motion = before[0] + noise, before[1] + sensitivity, before[2] + drift
         self._calibration = calibration.values
 
     def begin(self, pose: FloatArray) -> None:
@@ -154,10 +158,9 @@ class History:
         self.poses.append(pose)
         self.calibrations.append(calibration)
         start = self._end if self._start is None else self._start
-        motion = (self._motion_noise, self._sensitivity, self._drift, self._calibration)
-        self._new.append(_Step(start, self._end, *motion, keyframe, self._slip))
-        self._start = self._slip = None
-        self._motion_noise, self._sensitivity, self._drift = self._at_rest()
+        motion = self._motion or self._at_rest()
+        self._new.append(_Step(start, self._end, *motion, self._calibration, keyframe, self._slip))
+        self._start = self._slip = self._motion = None
 
     def add_calibration(self, values: FloatArray, variances: FloatArray) -> None:
         """Append what is estimated of a calibration (c,) from now on; nothing was seen of it."""
@@ -168,11 +171,10 @@ class History:
         self.summary = self.summary.with_calibration(self._axes, values, variances)
         self.calibrations = [np.append(known, values) for known in self.calibrations]
         self._calibration = np.append(self._calibration, values)
-        # Of the motion since the last keyframe.
-        _, no_effect, no_drift = self._at_rest()
-        c = self._sensitivity.shape[1]
-        no_effect[:, :c], no_drift[:c, :c] = self._sensitivity, self._drift
-        self._sensitivity, self._drift = no_effect, no_drift
+        if self._motion is not None:
+            noise, sensitivity, drift = self._motion
+            more = 0, len(values)
+            self._motion = noise, np.pad(sensitivity, ((0, 0), more)), np.pad(drift, more)
 
     def summarise(self, known: Prior) -> None:
         """Let ``known`` stand for all that the keyframes up to now say."""
@@ -312,7 +314,7 @@ class History:
             )
         return covariances
 
-    def _at_rest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _at_rest(self) -> _Motion:
         """Return the covariance, the sensitivity and the drift of no motion."""
         d, c = self._axes.p, len(self._calibration)
         return np.zeros((d, d)), np.zeros((d, c)), np.zeros((c, c))

@@ -7,6 +7,8 @@ What a calibrated sensor shows, y and Z, depends on its calibration, too.
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -18,6 +20,12 @@ from slam_observer_ros.observer.orientations import flip_verdicts
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, SeenTurns, Solution
 
+FlatSensed: TypeAlias = tuple[IntArray, FloatArray, FloatArray, FloatArray, IntArray]
+"""What C reads of the sensors of M points, see :meth:`SensedPoints.flat`."""
+
+NO_SENSORS = None, None, None, np.empty((0, 7)), np.empty((0, 7), dtype=np.int64)
+"""The same where none is calibrated."""
+
 
 class SensedPoints:
     """M points; the last ``count`` entries c_s of the calibration are those of their sensors.
@@ -27,7 +35,7 @@ class SensedPoints:
     """
 
     def __init__(self, sensed: Sensed, stated: FloatArray, columns: IntArray, c: int) -> None:
-        self._sensed = sensed
+        self._sensed, self._of_sensors = sensed, (stated, columns)
         self._stated, self._columns = stated[sensed.sensors], columns[sensed.sensors]
         self._are_estimated = self._columns >= 0
         self._first = int(np.min(columns, where=columns >= 0, initial=c))
@@ -42,6 +50,13 @@ class SensedPoints:
         values = self._values(calibrations)
         arms = predicted - self._sensed.origins - values[:, 3:6]
         return self._estimated(sensitivity(values, arms))
+
+    def flat(self, calibration: FloatArray) -> FlatSensed:
+        """Return sensors (M,), their origins and arms (M, 3), values and columns (s, 7)."""
+        sensed, (stated, columns) = self._sensed, self._of_sensors
+        estimated = np.append(calibration, 0.0)[columns]
+        values = np.where(columns >= 0, estimated, stated)
+        return sensed.sensors, sensed.origins, sensed.arms, values, columns
 
     def turned(self, calibrations: FloatArray, Z: FloatArray) -> FloatArray:
         """Return orientations exp(ψ) Z (M, 3, 3), body frame, that the sensors showed as Z."""

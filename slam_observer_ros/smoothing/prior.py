@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.geometry.matrices import definite_inverse, solve_definite, transpose
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 
 ANYWHERE_M = 1e3
@@ -73,7 +73,7 @@ class Prior:
         shared, own = self.covariance[turns, first:], self.covariance[first:, first:]
         least = EXACT_M**2 + np.finfo(np.float64).eps * np.trace(own)
         regular = own + least * np.eye(len(own))
-        return max(float(np.trace(shared @ np.linalg.solve(regular, shared.T))), 0.0)
+        return max(float(np.trace(shared @ solve_definite(regular, shared.T))), 0.0)
 
     def without(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior without the landmarks at ``rows``; those behind move up."""
@@ -221,8 +221,10 @@ class Prior:
 
 def inverse(covariances: FloatArray) -> FloatArray:
     """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
-    jitter = EXACT_M**2 * np.eye(covariances.shape[-1])
-    return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)
+    known = covariances + EXACT_M**2 * np.eye(covariances.shape[-1])
+    if known.ndim == 2:
+        return definite_inverse(known)
+    return np.asarray(np.linalg.inv(known), dtype=np.float64)
 
 
 def _with_unknown(covariance: FloatArray, columns: IntArray, sigma: float) -> FloatArray:

@@ -130,7 +130,7 @@ class Relinearisation:
 
     def note_correction(self, before: FloatArray, after: FloatArray) -> None:
         """Note a correction that turned the robot from Â to another (4, 4)."""
-        change = (after[:3, :3] - before[:3, :3]).ravel()
+        change = (after - before)[:3, :3].ravel()
         half_sine = math.sqrt(change.dot(change) / 8.0)
         turn_rad = 2.0 * math.asin(min(half_sine, 1.0))
         self._turn_squared += turn_rad**2

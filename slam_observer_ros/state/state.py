@@ -13,6 +13,7 @@ from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
 from slam_observer_ros.observer.gains import Errors, Gains
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
@@ -60,6 +61,11 @@ class State:
             past = self.relinearisation.copy(other.known_errors, other.calibration)
             other.relinearisation = past
         return other
+
+    @property
+    def joint(self) -> JointCovariance | None:
+        """P, in the form that suits the map, of gains that know it."""
+        return None if self.errors is None else self.errors.joint
 
     @property
     def known_errors(self) -> Errors:

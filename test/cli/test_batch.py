@@ -15,10 +15,9 @@ import sys
 import time
 
 from browser import open_page
-from command_line import CommandLine
 import numpy as np
 import pytest
-from recordings import events, write_mcap, write_rosbag1
+from recordings import events, SAMPLE, write_mcap, write_rosbag1
 
 from slam_observer_ros.cli.batch_index import write_index
 from slam_observer_ros.cli.batch_jobs import grid_points, opened_log, part_of, read_logs
@@ -28,7 +27,6 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.accuracy import FIGURES
 
-SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 PATIENCE_S = 60.0
 RUN = {
     'run': 'a',
@@ -41,11 +39,6 @@ RUN = {
 }
 """What a line has at least."""
 GRID = ('--grid', 'point_noise=0.02,0.05', '--grid', 'observation_model=cartesian')
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture(name='recordings')

@@ -9,15 +9,14 @@ import subprocess
 import sys
 import time
 
-from command_line import CommandLine
 import pytest
+from recordings import SAMPLE
 
 from slam_observer_ros.cli import batch_pool
 from slam_observer_ros.cli.batch_jobs import read_logs
 
 pytest.importorskip('distributed', reason="no Dask is installed (pip's extra 'cluster')")
 
-SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 PATIENCE_S = 100.0
 RUNS = 5
 GRID = ('--grid', 'range_noise=' + ','.join(f'0.{number}' for number in range(1, RUNS + 1)))
@@ -80,7 +79,7 @@ def figures_of(lines):
 
 
 @pytest.mark.timeout(400)  # Dask takes long to start on a busy machine
-def test_a_cluster_that_loses_a_worker_does_every_run_once(cluster, capsys, tmp_path):
+def test_a_cluster_that_loses_a_worker_does_every_run_once(cluster, slam_observer, tmp_path):
     remote, local = tmp_path / 'remote', tmp_path / 'local'
     command = [sys.executable, '-m', 'slam_observer_ros.cli.main', 'batch', str(SAMPLE), *GRID]
     batch = subprocess.Popen(
@@ -96,7 +95,7 @@ def test_a_cluster_that_loses_a_worker_does_every_run_once(cluster, capsys, tmp_
     assert batch.wait(PATIENCE_S) == 0
     lines = read_logs(remote)
     assert len((remote / 'runs.jsonl').read_text().splitlines()) == len(lines) == RUNS
-    CommandLine(capsys).succeed('batch', SAMPLE, *GRID, '--out', local, '--trajectories')
+    slam_observer.succeed('batch', SAMPLE, *GRID, '--out', local, '--trajectories')
     assert figures_of(lines) == figures_of(read_logs(local))
     for line in lines.values():
         file = line['trajectory']
@@ -126,8 +125,10 @@ def test_a_scheduler_that_can_not_be_is_an_error_in_one_line(tmp_path):
     assert all('no Dask scheduler answers there' in line for line in lines)
 
 
-def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(monkeypatch, capsys, tmp_path):
+def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(
+    monkeypatch, slam_observer, tmp_path
+):
     monkeypatch.setattr(batch_pool, 'CONNECT_S', 1.0)
     options = ('batch', SAMPLE, '--out', tmp_path / 'r', '--scheduler', 'tcp://127.0.0.1:9')
-    assert 'no Dask scheduler answers there' in CommandLine(capsys).fail(*options)
+    assert 'no Dask scheduler answers there' in slam_observer.fail(*options)
     assert not list(tmp_path.iterdir())

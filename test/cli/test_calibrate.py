@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 import math
 
-from command_line import CommandLine
 from gain_worlds import drive
 import numpy as np
 import pytest
@@ -35,11 +34,6 @@ OPTIONS = [
 ]
 TURNED_RAD, SHIFTED_M, LONGER, LATE_S = math.radians(2.0), 0.03, 1.02, 0.2
 SURVEYED_M = 1e-3
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 def recorded(path, world):

@@ -11,7 +11,6 @@ import re
 import shutil
 import sys
 
-from command_line import CommandLine
 import numpy as np
 import pytest
 import recordings
@@ -35,11 +34,6 @@ REPORT_KEYS = {
     'localised_after_s', 'unaligned_rmse_m', 'used', 'velocity_topic', 'landmarks_topic',
     'imu_topic', 'gains', 'truth_covered', 'configuration_anees', 'map',
 }  # fmt: skip
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture(scope='module')

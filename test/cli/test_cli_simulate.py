@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from command_line import CommandLine
 import numpy as np
 import pytest
 
@@ -10,11 +9,6 @@ from slam_observer_ros.evaluation.metrics import fit_decay
 from slam_observer_ros.runs.simulated_run import LYAPUNOV_FLOOR
 
 PAPER_SLOPE = -2.0 * (1.0 / 4.0) / np.log(10.0)
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 def test_by_default_log_lyapunov_falls_at_the_rate_of_the_paper(slam_observer):

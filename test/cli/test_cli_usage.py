@@ -10,7 +10,6 @@ import sys
 import time
 
 from absent_packages import program_without
-from command_line import CommandLine
 import pytest
 import recordings
 
@@ -19,11 +18,6 @@ from slam_observer_ros.cli.options import find_config
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, '-m', 'slam_observer_ros.cli.main']
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture

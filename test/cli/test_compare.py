@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 import re
 
-from command_line import CommandLine
 import pytest
-from recordings import write_beginning, write_mcap
+from recordings import SAMPLE, write_beginning, write_mcap
 
 from slam_observer_ros.cli.main import main
-
-SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 def test_gains_files_and_trajectories_are_compared(slam_observer, tmp_path):

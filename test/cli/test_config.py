@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from command_line import CommandLine
 import jsonschema
 import pytest
 import yaml
@@ -14,11 +13,6 @@ from slam_observer_ros.cli.config import ROWS
 from slam_observer_ros.settings.parameter_file import mixed_lists, read_parameter_file
 
 CONFIGS = Path(__file__).parents[2] / 'config'
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture(name='schema')

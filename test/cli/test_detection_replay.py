@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 import re
 
-from command_line import CommandLine
 import detector_messages as detector
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -140,11 +139,6 @@ def recordings(tmp_path_factory):
         'unplaced': ['/detections'],
     }
     return {name: record(folder / name, *topics) for name, topics in chosen.items()}
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture

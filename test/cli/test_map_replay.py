@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 
-from command_line import CommandLine
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -22,11 +21,6 @@ BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
 LANDMARKS = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
 POINT_NOISE_M = 0.02
 SETTINGS = ('--set', 'observation_model=cartesian', '--set', f'point_noise={POINT_NOISE_M}')
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 def record(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from command_line import CommandLine
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -27,11 +26,6 @@ IDS = np.arange(12)
 PAN_RATE = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
 CAMERA = se3.from_rpy((0.1, 0.0, 0.2, -np.pi / 2, 0.0, -np.pi / 2))
 IMU_MOUNT = se3.from_rpy((0.1, 0.2, 0.3, 0.0, np.pi / 2, 0.0))
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 def true_pose(stamp_ns):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from command_line import CommandLine
 import numpy as np
 import pytest
 from recordings import events, MESSAGE_COUNT, write_mcap
@@ -17,11 +16,6 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.writer import RecordingWriter
 
 LAYOUT = Path(__file__).resolve().parents[2] / 'foxglove' / 'replay.json'
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture(name='recording')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from command_line import CommandLine
 import detector_messages as detector
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ def record(path):
 
 
 @pytest.fixture
-def ended(capsys):
+def ended(slam_observer):
     """Replay a recording; return how it ended."""
     # So large a noise of the velocity leaves the ids in doubt, which takes most of the time.
     settings = SETTINGS | {'max_hypotheses': 1}
@@ -62,7 +61,7 @@ def ended(capsys):
     def run(path, use_tag_orientation, *more):
         chosen = [*options, f'use_tag_orientation={use_tag_orientation}']
         arguments = [word for option in chosen for word in ('--set', option)]
-        return CommandLine(capsys)('replay', path, '--json', *arguments, *more)
+        return slam_observer('replay', path, '--json', *arguments, *more)
 
     return run
 
@@ -102,7 +101,7 @@ def test_orientations_are_smoothed_and_written_to_the_map(replay, tmp_path):
 
 
 @pytest.fixture
-def in_a_map(tmp_path, capsys, ended):
+def in_a_map(tmp_path, slam_observer, ended):
     """Replay from a known start, in a map of the true tags that was a table; return the end."""
     path, table, made = (tmp_path / name for name in ('tags', 'tags.csv', 'map.yaml'))
     points, orientations = true_tags(np.random.default_rng(SEED))
@@ -113,7 +112,7 @@ def in_a_map(tmp_path, capsys, ended):
 
     def run(tag_axes, use_tag_orientation='true'):
         convert = ('map', 'convert', table, made, '--tag-axes', tag_axes, '--force')
-        CommandLine(capsys).succeed(*convert)
+        slam_observer.succeed(*convert)
         chosen = ('--set', 'set_initial_pose=true', '--set', 'localization_mode=uncertain')
         return ended(path, use_tag_orientation, '--load-map', made, *chosen)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from command_line import CommandLine
 import numpy as np
 import pytest
 import yaml
@@ -33,11 +32,6 @@ TRUE_NOISE = {
     'linear_velocity_noise': DRIVE_NOISE,
     'point_noise': POINT_NOISE_M,
 }
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 def simulated(path, seed):

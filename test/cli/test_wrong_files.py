@@ -6,16 +6,14 @@ import os
 from pathlib import Path
 import shutil
 
-from command_line import CommandLine
 import pytest
-
-SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
+from recordings import SAMPLE
 
 
 @pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys, tmp_path, monkeypatch):
+def fixture_slam_observer(slam_observer, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    return CommandLine(capsys)
+    return slam_observer
 
 
 @pytest.fixture(name='recording')

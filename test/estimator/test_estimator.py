@@ -365,6 +365,19 @@ def test_empty_observations_make_no_others_late():
     np.testing.assert_array_equal(beside_empty_ones.pose_covariance, alone.pose_covariance)
 
 
+@pytest.mark.parametrize('gains', ['riccati', 'scheduled', 'constant'])
+def test_pose_and_covariance_lead_on_along_the_velocities_together(gains):
+    estimator = Estimator(Settings(reorder_window=0.0, gains=gains))
+    turning = np.array([0.1, 0.0, 0.4, 1.0, 0.1, 0.0])
+    for event in (velocity(0.0, turning), observation(0.1), velocity(0.15, turning)):
+        estimator.add(event)
+        pose, covariance = estimator.uncertain_pose
+        np.testing.assert_array_equal(pose, estimator.pose)
+        np.testing.assert_array_equal(covariance, estimator.pose_covariance)
+        at_stamp = estimator.pose_at(estimator.stamp_ns)
+        np.testing.assert_allclose(pose, at_stamp, rtol=0, atol=1e-14)
+
+
 def test_an_update_is_of_the_state_at_its_stamp_and_stamps_never_go_back():
     reported = []
     estimator = Estimator(

@@ -9,12 +9,11 @@ import subprocess
 import sys
 import zipfile
 
-from command_line import CommandLine
 import pytest
+from recordings import SAMPLE
 
 from slam_observer_ros.cli.main import main
 
-SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 SAME_STAMPS = ('--sync_method', 'interpolation', '--t_max_diff', '0.25')
 """As a replay compares: with the truth in between its samples, half a second apart at most."""
 
@@ -46,10 +45,10 @@ def fixture_run_evo(folder, tmp_path, monkeypatch):
 
 
 @pytest.fixture(name='ours')
-def fixture_ours(folder, capsys):
+def fixture_ours(folder, slam_observer):
     """Return what we find of the trajectory, and what is there of the truth for evo."""
     tum = folder / 'run.tum'
-    return CommandLine(capsys).succeed('compare', SAMPLE, tum, '--json').json['compared'][str(tum)]
+    return slam_observer.succeed('compare', SAMPLE, tum, '--json').json['compared'][str(tum)]
 
 
 @pytest.fixture(name='truth')

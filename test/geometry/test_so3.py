@@ -101,6 +101,7 @@ def test_left_jacobian_inverse(phi: FloatArray) -> None:
 @given(R=rotations())
 def test_quaternions_are_unit_xyzw_and_agree_with_scipy(R: FloatArray) -> None:
     quaternion = so3.to_quaternion(R)
+    np.testing.assert_array_equal(so3.to_quaternion(R[None]), quaternion[None])
     assert quaternion[3] >= 0.0
     assert np.linalg.norm(quaternion) == pytest.approx(1.0, abs=1e-15)
     expected = Rotation.from_matrix(R).as_quat()

@@ -19,6 +19,9 @@ from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.writer import RecordingWriter
 
+SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
+"""The recording that comes with the package."""
+
 STEP_NS = 20_000_000
 LANDMARKS = LandmarkTruth(np.array([3, 5, 9]), np.arange(9.0).reshape(3, 3))
 MESSAGE_COUNT = 100

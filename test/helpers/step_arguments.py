@@ -126,7 +126,7 @@ def random_observation(rng):
         *(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3))),
         np.zeros((0 if seen.covariances is None else m, 3, 3)),
         np.zeros(m),
-        np.zeros(x.first - p),
+        np.zeros(x.first),
         np.zeros(int(rng.choice([0, 3 * m + 1]))),
         np.zeros(int(rng.choice([0, m * (m + 1) * k * k]))),
     )
@@ -139,40 +139,51 @@ def wrong(rng, arguments):
     """Return the arguments with one of them, or a part of one, exchanged for something else."""
     arguments = list(arguments)
     at = int(rng.integers(len(arguments)))
-    if arguments[at] is None:
-        arguments[at] = 3
+    if not isinstance(arguments[at], tuple):
+        arguments[at] = 3 if arguments[at] is None else other_than(rng, arguments[at])
         return arguments
     parts = list(arguments[at])
     part = int(rng.integers(len(parts)))
-    value = parts[part]
+    parts[part] = other_than(rng, parts[part])
+    arguments[at] = tuple(parts)
+    return arguments
+
+
+def other_than(rng, value):
+    """Return what a value is not."""
     others = [None, 'x', -1, 2**62, -(2**62), 10**30, float('nan'), np.empty(0), (), b'']
     if isinstance(value, np.ndarray):
+        with np.errstate(over='ignore'):
+            single = value.astype(np.float32)
         others += [
             value[..., None],
             value[:-1] if value.ndim else value,
-            value.astype(np.float32),
+            single,
             np.asfortranarray(np.repeat(value, 2, axis=-1))[..., ::2] if value.ndim else value,
             np.full(value.shape, 2**62, dtype=np.int64),
             np.full(value.shape, np.nan),
             np.full(value.shape, 1e300),
             np.zeros_like(value),
         ]
-    parts[part] = others[int(rng.integers(len(others)))]
-    arguments[at] = type(arguments[at])(*parts)
-    return arguments
+    return others[int(rng.integers(len(others)))]
+
+
+def refusals(rng, calls):
+    """Make calls, each with its arguments and with wrong ones; count those that are refused."""
+    refused = 0
+    for call, arguments in calls:
+        call(*arguments)
+        try:
+            call(*wrong(rng, arguments))
+        except (ValueError, TypeError, BufferError, OverflowError):
+            refused += 1
+    return refused
 
 
 def fuzz(core, seed, rounds):
     """Call both functions with arguments that are right and with wrong ones; count refusals."""
     rng, refused = np.random.default_rng(seed), 0
     for _ in range(rounds):
-        for call, arguments in (
-            (core.advance, random_motion(rng)),
-            (core.observe, random_observation(rng)),
-        ):
-            call(*arguments)
-            try:
-                call(*wrong(rng, arguments))
-            except (ValueError, TypeError, BufferError, OverflowError):
-                refused += 1
+        calls = (core.advance, random_motion(rng)), (core.observe, random_observation(rng))
+        refused += refusals(rng, calls)
     return refused

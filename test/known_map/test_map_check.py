@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from command_line import CommandLine
 import numpy as np
 import pytest
 
@@ -89,8 +88,7 @@ def test_what_looks_the_same_is_logged_with_what_would_help(caplog):
     assert 'add one more landmark: at (' in caplog.text
 
 
-def test_the_command_says_it_and_draws_it(capsys, tmp_path):
-    slam_observer = CommandLine(capsys)
+def test_the_command_says_it_and_draws_it(slam_observer, tmp_path):
     path, picture = tmp_path / 'hall.yaml', tmp_path / 'hall.png'
     write_map(path, hall(turned_by_half()), None)
     output = slam_observer('map', 'check', path, '--view', '8m', '--fov', 270, '--plot', picture)

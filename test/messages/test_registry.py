@@ -7,7 +7,6 @@ from pathlib import Path
 import re
 import struct
 
-from command_line import CommandLine
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
@@ -101,11 +100,11 @@ def write_beacons(path):
 
 
 @pytest.mark.usefixtures('beacons')
-def test_the_example_of_contributing_is_all_that_a_landmark_type_takes(tmp_path, capsys):
+def test_the_example_of_contributing_is_all_that_a_landmark_type_takes(tmp_path, slam_observer):
     path = write_beacons(tmp_path / 'run.mcap')
     options = ('--set', 'landmarks_type=BeaconArray', '--set', 'sensor_frame=base_link', '--json')
     for chosen in (options, options[2:]):  # named, and found by its type
-        ended = CommandLine(capsys)('replay', path, *chosen)
+        ended = slam_observer('replay', path, *chosen)
         assert (ended.code, ended.json['landmarks']) == (0, 3), ended.errors
     with Recording(path) as recording:
         selected = recording.find_topics()
@@ -117,8 +116,10 @@ def test_the_example_of_contributing_is_all_that_a_landmark_type_takes(tmp_path,
 
 
 @pytest.mark.usefixtures('beacons')
-def test_parameters_and_help_offer_a_type_and_an_unread_one_is_said_to_be_none(tmp_path, capsys):
-    helped = CommandLine(capsys)('replay', '--help').output
+def test_parameters_and_help_offer_a_type_and_an_unread_one_is_said_to_be_none(
+    tmp_path, slam_observer
+):
+    helped = slam_observer('replay', '--help').output
     of_landmarks = helped.rpartition('--landmarks-topic TOPIC')[2]
     assert 'BeaconArray' in of_landmarks.partition('--imu TOPIC')[0]
     assert 'BeaconArray' in choices(InputSettings, 'landmarks_type')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from command_line import CommandLine
 from node_processes import running
 import numpy as np
 import pytest
@@ -14,11 +13,6 @@ from slam_observer_ros.nodes.live_inputs import HeardTopic
 from slam_observer_ros.nodes.message_classes import MESSAGES
 
 pytestmark = pytest.mark.ros
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 def test_topics_that_are_alive_are_named_with_what_a_node_needs_to_hear_them(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from command_line import CommandLine
 from data_set_files import write_mrclam, write_starry_night
 import numpy as np
 import pytest
@@ -21,12 +20,6 @@ from slam_observer_ros.recording.starry_night import (
 from slam_observer_ros.recording.writer import DataSet, write_data_set
 
 SECOND_NS = 1_000_000_000
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    """Run the command inside the test."""
-    return CommandLine(capsys)
 
 
 def point_errors(data_set: DataSet, poses: np.ndarray) -> np.ndarray:

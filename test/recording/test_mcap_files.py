@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import tracemalloc
 
-from command_line import CommandLine
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
@@ -60,12 +59,6 @@ def contents(path):
         selected = recording.find_topics()
         assert len(list(recording.events(selected))) == recording.event_count(selected)
         return found, recording.loss, recording.warning
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    """Run the command inside the test."""
-    return CommandLine(capsys)
 
 
 @pytest.mark.parametrize('compression', list(CompressionType))

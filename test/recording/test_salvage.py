@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from command_line import CommandLine
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -100,12 +99,6 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp('whole')
     writers = {'mcap': write_mcap, 'db3': write_db3, 'bag': write_bag}
     return {name: write(folder / f'run.{name}') for name, write in writers.items()}
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    """Run the command inside the test."""
-    return CommandLine(capsys)
 
 
 def read(path: Path):

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 import re
 
-from command_line import CommandLine
 import pytest
-from recordings import write_beginning
-
-SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
+from recordings import SAMPLE, write_beginning
 
 
 @pytest.fixture(name='advice')
-def fixture_advice(capsys, tmp_path):
+def fixture_advice(slam_observer, tmp_path):
     def advice(recording=SAMPLE, **settings):
         report = tmp_path / 'run.html'
         options = [
             word for name, value in settings.items() for word in ('--set', f'{name}={value}')
         ]
-        ended = CommandLine(capsys)('replay', recording, '--report', report, *options)
+        ended = slam_observer('replay', recording, '--report', report, *options)
         assert ended.code == 0
         found = re.search(r'id="numbers">(.*?)</script>', report.read_text(), re.S)
         findings = json.loads(found.group(1))['findings']

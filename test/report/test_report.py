@@ -10,10 +10,9 @@ import re
 import shutil
 
 from browser import open_page
-from command_line import CommandLine
 import numpy as np
 import pytest
-from recordings import events, MESSAGE_COUNT, write_mcap
+from recordings import events, MESSAGE_COUNT, SAMPLE, write_mcap
 
 from slam_observer_ros import __version__
 from slam_observer_ros.cli.main import main
@@ -22,13 +21,7 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.error_health import growth_windows
 
-SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 MEGABYTE = 1_000_000
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture(name='reported', scope='module')

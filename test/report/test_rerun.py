@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from command_line import CommandLine
 import numpy as np
 import pytest
 from recordings import MESSAGE_COUNT, write_mcap
-
-
-@pytest.fixture(name='slam_observer')
-def fixture_slam_observer(capsys):
-    return CommandLine(capsys)
 
 
 @pytest.fixture(name='recording')

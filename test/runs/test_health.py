@@ -8,7 +8,6 @@ from pathlib import Path
 import re
 import string
 
-from command_line import CommandLine
 import pytest
 from recordings import events
 
@@ -93,9 +92,9 @@ def fixture_wild(tmp_path):
     return tmp_path / 'wild.mcap'
 
 
-def test_log_json_report_and_recorded_diagnostics_say_the_same(wild, tmp_path, capsys):
+def test_log_json_report_and_recorded_diagnostics_say_the_same(wild, tmp_path, slam_observer):
     report = tmp_path / 'run.html'
-    ended = CommandLine(capsys)('replay', wild, '--json', '--report', report, '--gains', 'riccati')
+    ended = slam_observer('replay', wild, '--json', '--report', report, '--gains', 'riccati')
     findings = ended.json['findings']
     assert 'rejected_points' in [finding['kind'] for finding in findings]
     numbers = json.loads(re.search(r'id="numbers">(.*?)</script>', report.read_text(), re.S)[1])

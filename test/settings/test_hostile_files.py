@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from command_line import CommandLine
 from hypothesis import given
 from hypothesis import strategies as st
 import pytest
@@ -58,12 +57,6 @@ HOSTILE = {
     'several documents': '--- 1\n--- 2\n',
     'no text': '\0',
 }  # fmt: skip
-
-
-@pytest.fixture
-def slam_observer(capsys):
-    """Run the command inside the test."""
-    return CommandLine(capsys)
 
 
 def refusal(read: Callable[[Path], object], path: Path) -> str:

@@ -1,62 +1,19 @@
 """The normal equations of a chain of poses and what they share, against dense algebra."""
 
+from newton_arguments import D, random_equations
 import numpy as np
 import pytest
 
-from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, SMALL_BORDER
-
-D, C, K = 3, 2, 2
-SEEN = 4
+from slam_observer_ros.smoothing import bordered_chain
+from slam_observer_ros.smoothing.bordered_chain import Factors, SMALL_BORDER
 
 
-def random_equations(S, landmarks):
-    """Return equations and their dense matrix and gradient, poses first."""
-    rng, b = np.random.default_rng(S), C + K * landmarks
-    poses = np.repeat(np.arange(S), SEEN)
-    seen_landmarks = (poses + rng.integers(0, landmarks, len(poses))) % landmarks
-    A = np.zeros((0, S * D + b))
-
-    def measure(rows, *columns):
-        nonlocal A
-        J = np.zeros((rows, A.shape[1]))
-        places = np.concatenate(columns)
-        J[:, places] = rng.normal(size=(rows, len(places)))
-        A = np.concatenate([A, J])
-
-    border = S * D + np.arange(b)
-    measure(D + b, np.arange(D), border)
-    for s in range(S - 1):
-        measure(D, np.arange(s * D, (s + 2) * D), border[:C])
-    for s, i in zip(poses, seen_landmarks, strict=True):
-        measure(K, np.arange(s * D, (s + 1) * D), border[C + K * i :][:K])
-    H, g = A.T @ A, A.T @ rng.normal(size=len(A))
-    blocks = H[: S * D, : S * D].reshape(S, D, S, D)
-    B = H[: S * D, S * D :].reshape(S, D, b)
-    first = B[0].copy()
-    first[:, :C] = 0.0
-    seen = np.array(
-        [B[s][:, C + K * i :][:, :K] for s, i in zip(poses, seen_landmarks, strict=True)]
-    )
-    # One block holds all that a pose has to do with a landmark, however often it was seen.
-    _, once = np.unique(poses * landmarks + seen_landmarks, return_index=True)
-    once = once[poses[once] > 0]
-    every = np.arange(S)
-    return (
-        Equations(
-            diagonal=blocks[every, :, every],
-            above=blocks[every[:-1], :, every[1:]],
-            shared=B[:, :, :C].copy(),
-            poses=poses[once],
-            landmarks=seen_landmarks[once],
-            seen=seen[once],
-            first=first,
-            corner=H[S * D :, S * D :],
-            gradient=g[: S * D].reshape(S, D),
-            border_gradient=g[S * D :],
-        ),
-        H,
-        g,
-    )
+@pytest.fixture(autouse=True, params=['C', 'numpy'])
+def fixture_implementation(request, monkeypatch):
+    if request.param == 'numpy':
+        monkeypatch.setattr(bordered_chain, 'COMPILED', None)
+    elif bordered_chain.COMPILED is None:
+        pytest.skip('it was not compiled, or is not to be used')
 
 
 chains = pytest.mark.parametrize('S', [1, 2, 8, 9, 10, 41])

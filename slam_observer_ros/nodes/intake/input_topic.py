@@ -27,6 +27,9 @@ DISCOVERY_S = 5.0
 Where an announcement was lost, as on a busy machine, DDS repeats it after 3 s only.
 """
 
+WELL_S = 1.0
+"""How long a topic on which messages come is not looked at again."""
+
 MAX_FULL_NAMES = 3  # of message types in a log line
 
 MessageT = TypeVar('MessageT')
@@ -134,6 +137,7 @@ class InputTopic(Generic[MessageT]):
         self.shedding = LoadShedding(max_wait_s)
         self._is_shedding = max_wait_s < math.inf
         self.last_received_s: float | None = None
+        self._checked_s = -WELL_S
         self._log = ThrottledLog(node, DISCOVERY_S)
         if len(decoders) == 1:
             self._subscribe(next(iter(decoders)))
@@ -162,7 +166,15 @@ class InputTopic(Generic[MessageT]):
         return self.shedding.problem(self.topic, now_s) or self.backlog.problem(self.topic, now_s)
 
     def check_publishers(self) -> None:
-        """See what the topic carries; subscribe to it, or report why nothing comes."""
+        """See what the topic carries; subscribe to it, or report why nothing comes.
+
+        While messages come and all was well, that is asked once a second: it takes a while.
+        """
+        age_s, now_s = self.age_s, time.monotonic()
+        is_well = age_s is not None and age_s < WELL_S and not self._fault
+        if is_well and now_s < self._checked_s + WELL_S:
+            return
+        self._checked_s = now_s
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         found = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in found]

@@ -178,8 +178,7 @@ class EstimatePublisher:
             return
         self._pace.note(source)
         self._fast_stamp_ns = stamp_ns
-        pose = self._estimator.pose
-        self._publish_pose(stamp_ns, pose)
+        pose = self._publish_pose(stamp_ns)
         if self.broadcaster is not None:
             self.broadcaster.add(stamp_ns, pose)
         self._extend_path(stamp_ns, pose)
@@ -240,24 +239,27 @@ class EstimatePublisher:
         stamp_ns = self._estimator.stamp_ns
         return stamp_ns not in (None, published_ns) and self._estimator.is_localised
 
-    def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
+    def _publish_pose(self, stamp_ns: int) -> FloatArray:
+        """Publish pose and odometry where they are read; return the pose (4, 4)."""
+        estimator = self._estimator
         poses, odometries = (
             publisher.get_subscription_count() for publisher in (self._pose, self._odometry)
         )
         if not (poses or odometries):
-            return
-        estimator = self._estimator
-        uncertain = uncertain_pose(pose, estimator.pose_covariance)
+            return estimator.pose
+        pose, covariance = estimator.uncertain_pose
+        uncertain = uncertain_pose(pose, covariance)
         if poses:
             self._pose.publish(self._state.pose(stamp_ns, uncertain))
         if odometries:
             velocity = estimator.body_velocity, estimator.body_velocity_covariance
             self._odometry.publish(self._state.odometry(stamp_ns, uncertain, *velocity))
+        return pose
 
     def _keep_pose(self, stamp_ns: int) -> None:
         """Publish the pose, while nobody reads it, for whoever comes later."""
         if not self._pose.get_subscription_count():
-            uncertain = uncertain_pose(self._estimator.pose, self._estimator.pose_covariance)
+            uncertain = uncertain_pose(*self._estimator.uncertain_pose)
             self._pose.publish(self._state.pose(stamp_ns, uncertain))
 
     def _publish_landmarks(self, stamp_ns: int) -> None:

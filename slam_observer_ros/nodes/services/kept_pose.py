@@ -55,13 +55,13 @@ class KeptPose:
         is_known = estimator.is_localised and stamp_ns not in (None, self._stamp_ns)
         if self._path is None or not is_known:
             return
-        covariance = estimator.pose_covariance
+        pose, covariance = estimator.uncertain_pose
         if covariance is None:
             covariance = np.zeros((6, 6))
         frame = self._settings.map_frame
         self._stamp_ns = stamp_ns
         try:
-            write_pose(self._path, StoredPose(estimator.pose, covariance, frame, time.time()))
+            write_pose(self._path, StoredPose(pose, covariance, frame, time.time()))
         except SlamObserverError as error:
             self._log.warning('pose_file', str(error))
 

@@ -90,6 +90,7 @@ class RiccatiGains(OrientationGains):
     def advance(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to P."""
         super().advance(motion)
+        self.joint.note_motion()
         observer, active = self.observer, self.joint.active
         points = observer.y_ref[active] + observer.a[active]
         self.joint.propagate(motion, points, observer.u[active])
