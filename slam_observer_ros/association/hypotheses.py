@@ -30,7 +30,7 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.slip import Contradictions
+from slam_observer_ros.association.slip import RejectedLandmarks
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
@@ -82,7 +82,7 @@ class Hypotheses:
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
-        self._contradictions = Contradictions()
+        self._rejected = RejectedLandmarks()
         self._new_landmarks = NewLandmarks()
         self._standing = Standing()
         self._velocities: VelocityHistory | None = None  # along which they were moved
@@ -203,7 +203,7 @@ class Hypotheses:
         """Let all hypotheses go on from where they are at any other time."""
         for hypothesis in self._all:
             hypothesis.state.clear_time()
-        self._contradictions.clear()
+        self._rejected.clear()
         self._standing.clear_time()
 
     def forget(self, landmark_id: int) -> bool:
@@ -276,7 +276,7 @@ class Hypotheses:
     def _observe_alone(self, event: ObservationEvent) -> Outcome:
         """Use an observation that can't be weighed: of a state without a joint covariance."""
         matched = match(self.best, event)
-        if self._contradictions.resolve(self.best, matched):
+        if self._rejected.explain_by_slip(self.best, matched):
             matched = match(self.best, event)
         return step(self.best, matched)
 
