@@ -20,17 +20,19 @@ from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     as_its_ids_say,
+    consistent,
     Interpretation,
     interpretations,
     is_ambiguous,
     may_relabel,
+    noted,
 )
 from slam_observer_ros.association.joint_compatibility import (
     pruning_cost,
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.slip import Contradictions
+from slam_observer_ros.association.slip import RejectedLandmarks
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
@@ -82,7 +84,7 @@ class Hypotheses:
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
-        self._contradictions = Contradictions()
+        self._rejected = RejectedLandmarks()
         self._new_landmarks = NewLandmarks()
         self._standing = Standing()
         self._velocities: VelocityHistory | None = None  # along which they were moved
@@ -182,7 +184,7 @@ class Hypotheses:
                 variances = np.diagonal(motion.covariances.sum(axis=0))
             if state is not self.best:
                 continue
-            self._standing.moved.append((before, state.observer.A.copy()))
+            self._standing.moved.append(se3.between(before, state.observer.A))
             calibration = state.filter.calibration
             if calibration.delay_error_ns:
                 self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
@@ -203,7 +205,7 @@ class Hypotheses:
         """Let all hypotheses go on from where they are at any other time."""
         for hypothesis in self._all:
             hypothesis.state.clear_time()
-        self._contradictions.clear()
+        self._rejected.clear()
         self._standing.clear_time()
 
     def forget(self, landmark_id: int) -> bool:
@@ -251,9 +253,11 @@ class Hypotheses:
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        if len(self._all) == 1 and (outcome := _observed(self.best, event)) is not None:
-            self._some_have_ids = True
-            return outcome
+        if len(self._all) == 1:
+            outcome = usual.observe(self.best, event) or in_parts.observe(self.best, event)
+            if outcome is not None:
+                self._some_have_ids = True
+                return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         if self.best.filter.joint is None:
@@ -276,7 +280,7 @@ class Hypotheses:
     def _observe_alone(self, event: ObservationEvent) -> Outcome:
         """Use an observation that can't be weighed: of a state without a joint covariance."""
         matched = match(self.best, event)
-        if self._contradictions.resolve(self.best, matched):
+        if self._rejected.explain_by_slip(self.best, matched):
             matched = match(self.best, event)
         return step(self.best, matched)
 
@@ -319,6 +323,7 @@ class Hypotheses:
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
+        hypothesis.verdicts = noted(hypothesis.verdicts, state, taken, event)
         if (event.ids == UNKNOWN_ID).any():
             hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
@@ -339,11 +344,17 @@ class Hypotheses:
         for number, hypothesis in enumerate(self._all):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
-            used = None if is_alone else _observed(state, event, is_weighed=True)
+            used = None
+            if not is_alone:
+                used = usual.observe(state, event, True) or in_parts.observe(state, event, True)
             meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
-            for taken in meanings or interpretations(
+            found = meanings or interpretations(
                 state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
-            ):
+            )
+            if not is_alone:
+                before = hypothesis.verdicts
+                found = consistent(before, state, found, event) or found * (number == 0)
+            for taken in found:
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
@@ -355,12 +366,6 @@ class Hypotheses:
             ids = hypothesis.state.landmarks.ids
             self._next_id = max(self._next_id, int(np.max(ids[is_automatic(ids)], initial=0)) + 1)
         return self._next_id + np.arange(m)
-
-
-def _observed(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
-    """Let a state use an observation, or a part of it, as usual; None where it is not."""
-    outcome = usual.observe(state, event, is_weighed)
-    return in_parts.observe(state, event, is_weighed) if outcome is None else outcome
 
 
 def _are_one(child: _Child, other: _Child) -> bool:

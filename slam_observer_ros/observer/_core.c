@@ -135,7 +135,7 @@ static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
         || x->first < x->p + x->c || x->first > x->room || x->N != x->first + x->k * x->n
         || x->N > x->room || !are_within(x->estimated, x->c_v, 12))
         return refuse("Estimate");
-    door->sizes['f'] = (Py_ssize_t)x->first - x->p;
+    door->sizes['f'] = (Py_ssize_t)x->first;
     return 1;
 }
 
@@ -222,7 +222,7 @@ typedef struct {
 static const char *const FACTORS[] = {"d2pp", "D2", "D22", "D2", "f", NULL};
 
 typedef struct {
-    double *A, *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *shift;
+    double *A, *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *moved;
     double *judged, *expected;
     int judges, says_expected;
 } Observed;
@@ -1184,7 +1184,7 @@ static void move(const Estimate *x, const double *dx, const Observed *out) {
         for (int b = 0; b < 3; b++)
             a[b] = turned_a[b] + (moved[b] + (turned[b] - y_ref[b]));
     }
-    memcpy(out->shift, dx + x->p, (size_t)(x->first - x->p) * sizeof(double));
+    memcpy(out->moved, dx, (size_t)x->first * sizeof(double));
 }
 
 /* Note that landmarks were seen, and where they should have been by the corrected state. */

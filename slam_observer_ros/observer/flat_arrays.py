@@ -14,7 +14,7 @@ class Estimate(NamedTuple):
     """X̂ and the covariance P of its errors (ε, c̃, ξ_1 … ξ_n), of a map of points at rest."""
 
     A: FloatArray  # (4, 4) Â
-    y_ref: FloatArray  # (n, 3) y_i°
+    y_ref: FloatArray  # (n, 3) y_i° of the landmarks that P has
     a: FloatArray  # (n, 3) â_i, changed in place
     P: FloatArray  # (room, room) of which the first N rows and columns count, changed in place
     size: int  # N
@@ -92,8 +92,7 @@ class Observed(NamedTuple):
     # (m, 3, 3) of the points, body frame, m²; (0, 3, 3) where none were stated
     covariances: FloatArray
     dt_s: FloatArray  # (m,) since each was seen before; infinite if it was not
-    # (first − p,) by how much the calibration is to be moved, and what is postponed
-    shift: FloatArray
+    moved: FloatArray  # (first,) −K r of pose, calibration and what is postponed
     # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
     # normalised innovation squared of all; empty where nobody asks
     judged: FloatArray

@@ -288,7 +288,7 @@ def observe(
     R_D = X.A[:3, :3]
     out.A[:] = X.A.dot(x.A)
     x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))
-    out.shift[:] = dx[axes.p : x.first]
+    out.moved[:] = dx[: x.first]
     out.weights[:] = weights
     _take_over(factors, learnt)
     if len(out.expected):

@@ -1,6 +1,7 @@
 """Where the usual step reads the arrays of a state, and a state takes over what that did.
 
-Both return None, with nothing changed, where anything is unusual: see :mod:`.observer.step`.
+Both return None, with no estimate changed, where anything is unusual: see :mod:`.observer.step`.
+Of large maps only those landmarks are read that are active, which those seen are by then.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Observed,
     Seen,
 )
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
 from slam_observer_ros.observer.riccati.riccati import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.motion_noise import Factors
@@ -34,6 +35,9 @@ from slam_observer_ros.sensor_models.velocity_history import Velocities, Velocit
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.covariances import of_pose
 from slam_observer_ros.state.state import State
+
+MOST_WORK = 1e7
+"""Multiplications of a correction of P beyond which BLAS, in the general way, takes less time."""
 
 _NO_ENTRIES, NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
 
@@ -68,7 +72,9 @@ def advance(
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    calibration = state.filter.calibration
+    calibration, joint = state.filter.calibration, state.filter.joint
+    if joint is not None:
+        joint.note_motion()
     if state.relinearisation is not None and state.relinearisation.is_active:
         history = state.relinearisation.history
         history.begin(x.A)
@@ -139,6 +145,7 @@ class Corrected(NamedTuple):
     """What the kernel made of points of known landmarks."""
 
     status: int  # DONE, or REJECTS: then nothing has changed
+    rows: IntArray  # (m,) which landmarks
     seen: Seen
     out: Observed
     factors: Factors | None  # what was learnt of the noise of the motion
@@ -179,7 +186,7 @@ def takes(state: State, event: ObservationEvent) -> bool:
         and event.orientations is None
         and event.sensed is None  # late, and carried forward
         and not (calibration.corrects_points and event.sensor_frame not in calibration.sensors)
-        and _estimate(state) is not None
+        and _is_of_points(state)
     )
 
 
@@ -194,10 +201,14 @@ def correct(
 
     Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
     """
-    m, k, x = len(rows), state.axes.point, _estimate(state)
-    if x is None or not 0 < m <= AT_ONCE:
+    m, k, joint = len(rows), state.axes.point, state.filter.joint
+    if joint is None or not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
         return None
-    seen = _seen(state, event, rows)
+    joint.activate(rows)
+    x, places = _estimate(state), joint.places(rows)
+    if x is None:
+        return None
+    seen = _seen(state, event, places)
     settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
     factors = noise.flat() if of_all is None else None
     out = Observed(
@@ -209,7 +220,7 @@ def correct(
         np.empty((m, 3)),
         np.empty((0 if event.covariances is None else m, 3, 3)),
         np.empty(m),
-        np.empty(x.first - state.axes.p),
+        np.empty(x.first),
         np.empty(3 * m + 1) if state.judges_innovations else _NO_ENTRIES,
         np.empty(m * (m + 1) * k * k) if is_weighed else _NO_ENTRIES,
     )
@@ -221,7 +232,8 @@ def correct(
         settings.max_rejections,
         settings.max_hypotheses > 1,
     )
-    landmarks = Landmarks(table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns)
+    columns = table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns
+    landmarks = Landmarks(*(column[joint.active] for column in columns))
     figures = state.observation_noise.figures
     status = core.observe(x, landmarks, seen, figures, limits, factors, out)
     if status == step.UNUSUAL:
@@ -231,22 +243,42 @@ def correct(
         if state.relinearisation is not None:
             state.relinearisation.note_correction(x.A, out.A)
         x.A[...] = out.A
-        if len(out.shift):
-            state.filter.calibration.shift(out.shift)
+        if not joint.is_dense:  # else these are views
+            state.observer.a[joint.active] = x.a
+            for column, changed in zip(columns, landmarks, strict=True):
+                column[rows] = changed[places]
+            joint.follow(out.moved)
+        calibration, p = state.filter.calibration, state.axes.p
+        if calibration.count:
+            calibration.shift(out.moved[p : p + calibration.count])
         state.rejected_in_a_row, state.was_contradicted = 0, False
-    return Corrected(status, seen, out, factors)
+    return Corrected(status, rows, seen, out, factors)
 
 
 def _estimate(state: State) -> Estimate | None:
     """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
     joint, observer = state.filter.joint, state.observer
-    if type(joint) is not JointCovariance or joint.chart.stride > state.axes.point:
+    if joint is None or not _is_of_points(state):
         return None
-    if observer.have_moved:
-        return None
-    matrix = joint._matrix
+    matrix, active = joint._matrix, joint.active
     return _estimate_of(
-        state, observer.y_ref, observer.a, matrix._storage, matrix._size, joint.first
+        state,
+        observer.y_ref[active],
+        observer.a[active],
+        matrix._storage,
+        matrix._size,
+        joint.first,
+    )
+
+
+def _is_of_points(state: State) -> bool:
+    """Return whether what is estimated is a map of points at rest, and no more of them."""
+    joint = state.filter.joint
+    return (
+        joint is not None
+        and not isinstance(joint, ExactMapCovariance)
+        and joint.chart.stride == state.axes.point
+        and not state.observer.have_moved
     )
 
 
@@ -299,8 +331,8 @@ def _room_for_motion(state: State) -> Advanced:
     )
 
 
-def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
-    """Return points of known landmarks, and what of their sensor is calibrated."""
+def _seen(state: State, event: ObservationEvent, places: IntArray) -> Seen:
+    """Return points of landmarks at ``places`` of P, and what of their sensor is calibrated."""
     arms, covariances = _plain(event.lines_of_sight), event.covariances
     origins = event.sensor
     calibration = state.filter.calibration
@@ -316,7 +348,7 @@ def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
             covariances = covariances / cosines[:, None, None] ** 2
     return Seen(
         event.stamp_ns,
-        rows,
+        places,
         arms,
         None if origins is None else _plain(origins),
         None if covariances is None else _plain(covariances),
@@ -340,7 +372,14 @@ def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Key
         sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
     stated = out.covariances if len(out.covariances) else None
     return Keyframe(
-        event.stamp_ns, seen.rows, out.points, out.lines_of_sight, stated, out.dt_s, None, sensed
+        event.stamp_ns,
+        corrected.rows,
+        out.points,
+        out.lines_of_sight,
+        stated,
+        out.dt_s,
+        None,
+        sensed,
     )
 
 

@@ -126,7 +126,7 @@ def random_observation(rng):
         *(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3))),
         np.zeros((0 if seen.covariances is None else m, 3, 3)),
         np.zeros(m),
-        np.zeros(x.first - p),
+        np.zeros(x.first),
         np.zeros(int(rng.choice([0, 3 * m + 1]))),
         np.zeros(int(rng.choice([0, m * (m + 1) * k * k]))),
     )

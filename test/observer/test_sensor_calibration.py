@@ -188,7 +188,7 @@ def test_the_range_scale_is_not_biased_by_noise(monkeypatch):
         return sensitivity(state, event)
 
     monkeypatch.setattr('slam_observer_ros.state.matching.sensitivity', at_the_point_measured)
-    monkeypatch.setattr('slam_observer_ros.state.usual.observe', lambda *_: None)
+    monkeypatch.setattr('slam_observer_ros.state.usual.takes', lambda *_: False)
     assert np.mean(range_scales(20)) < -6.0 / math.sqrt(20)
 
 

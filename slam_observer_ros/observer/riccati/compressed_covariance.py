@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 CHECK_INTERVAL = 20
-"""Corrections in which each landmark is looked at once, whether it is near its reference."""
+"""Observations in which each landmark is looked at once, whether it is near its reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class CompressedCovariance(JointCovariance):
         self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
         self._set_active(np.arange(n), n)
         self._following = FollowingLandmarks(self.chart, observer)
-        self._corrections, self._most = 0, size.most
+        self._checks, self._has_moved, self._most = 0, False, size.most
 
     def copy(self, observer: Observer) -> Self:
         """Return an independent copy, which shares what takes much memory until it changes."""
@@ -93,21 +93,35 @@ class CompressedCovariance(JointCovariance):
             self.follow(-Kr)
         return Kr
 
+    def places(self, rows: IntArray) -> IntArray:
+        """Return which of the landmarks in P these are (m,)."""
+        places: IntArray = self._places[rows]
+        return places
+
     def follow(self, x: FloatArray) -> None:
-        """Let others follow as the state is moved by exp(x), of which the first entries count."""
+        """Let all others follow when the state is moved by exp(x), of which ``first`` count."""
         turn = self._axes.full_pose(x[: self._p])[:3]
         self._postponed.move(turn, x[self._entries])
         self._following.work()
+
+    def note_motion(self) -> None:
+        """Let the next observation look at some references, by which motions are judged."""
+        self._has_moved = True
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks ``rows`` (m,), of an observation, are active."""
         missing = rows[self._places[rows] < 0]
         if len(missing) or len(self.active) > self._most:
             self._switch(self._chosen(rows))
-            return
-        self._corrections += 1
+        elif self._has_moved:  # once, however often an observation is looked at
+            self._has_moved = False
+            self._check_references()
+
+    def _check_references(self) -> None:
+        """Refer to present estimates if some of those that it is the turn of are far off."""
+        self._checks += 1
         if not self._outside.unchanged:
-            first = self._corrections % CHECK_INTERVAL
+            first = self._checks % CHECK_INTERVAL
             some = range(first, len(self._outside.panels), CHECK_INTERVAL)
             if not self._following.are_near(some):
                 self._restart(self.active[:0])

@@ -131,6 +131,13 @@ class JointCovariance:
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks (m,), which are going to be observed, are in P."""
 
+    def places(self, rows: IntArray) -> IntArray:
+        """Return which of the landmarks in P these are (m,)."""
+        return rows
+
+    def follow(self, x: FloatArray) -> None:
+        """Let all that is not in P follow, too, when the state is moved by exp(x)."""
+
     def dense(self) -> JointCovariance:
         """Return the same with all landmarks in P."""
         return self
@@ -144,6 +151,9 @@ class JointCovariance:
         return B
 
     # The step
+
+    def note_motion(self) -> None:
+        """Let it be known that the robot has moved."""
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
         """Let the robot move, and landmarks of velocities ``u`` (n, 3), to ``points`` (n, 3)."""

@@ -92,6 +92,7 @@ class RiccatiFilter(OrientationGains):
     def propagate(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to P."""
         super().propagate(motion)
+        self.joint.note_motion()
         observer, active = self.observer, self.joint.active
         points = observer.y_ref[active] + observer.a[active]
         self.joint.propagate(motion, points, observer.u[active])
