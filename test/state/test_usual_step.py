@@ -55,9 +55,8 @@ def parts(state):
     noise, sensitivity, drift = history._motion or history._at_rest()
     return {
         'A': state.observer.A,
-        'a': state.observer.a,
         'P': state.errors.joint.P,
-        'map': state.observer.points,
+        'map': state.observer.points,  # y° + â: what has hardly moved has no size of its own
         'calibration': state.calibration.values,
         'factors': np.concatenate([factors._logs, factors._information.ravel(), factors.applied]),
         'shares': np.zeros(()) if factors._shares is None else factors._shares,
