@@ -71,12 +71,13 @@ def checkpoints_s(loop: Loop) -> FloatArray:
 def run_once(loop_name: str, estimator_name: str, seed: int) -> FloatArray:
     """Return the NEES (c, 2) of pose and landmarks per degree of freedom, at each checkpoint.
 
-    A checkpoint is the first observation from its time on. The worlds have neither scale error
+    A checkpoint is the first observation from its time on. The robot moves as the model of all
+    estimators has it, also between two velocities. The worlds have neither scale error
     nor bias, and nobody estimates them, so that all estimators are judged by the same model.
     """
     loop = LOOPS[loop_name]
     settings = without_calibration(simulated_settings(loop.config))
-    world = drive(loop, settings, seed)
+    world = drive(loop, settings, seed, jitters=True)
     estimator = EkfSlam(settings) if estimator_name == EKF else observer('riccati')(settings)
     due_ns = list(np.rint(checkpoints_s(loop) * 1e9))
     nees = []

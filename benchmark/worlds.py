@@ -233,8 +233,11 @@ def circle() -> World:
     return World(settings, events, truth, simulation.landmark_truth(0))
 
 
-def drive(loop: Loop, settings: Settings, seed: int) -> World:
+def drive(loop: Loop, settings: Settings, seed: int, jitters: bool = False) -> World:
     """Drive a loop with noise that is just what ``settings`` say.
+
+    A velocity is off by the same for all of its period, unless the robot ``jitters``: then it
+    moves between two velocities as white noise has it, which is what filters assume.
 
     Observations state their covariances, computed where the landmarks really are: computed where
     a noisy sensor saw them they would be wrong, and no estimator could be consistent.
@@ -247,7 +250,7 @@ def drive(loop: Loop, settings: Settings, seed: int) -> World:
     walks = _walks(loop, settings.two_d_mode, seed) @ course[0][:3, :3]
     points -= loop.lap_s * np.linspace(0.0, 1.0, loop.landmarks)[:, None] * walks
     landmarks = LandmarkTruth(np.arange(loop.landmarks), points)
-    return recorded_on(poses, landmarks, walks, loop, settings, rng)
+    return recorded_on(poses, landmarks, walks, loop, settings, rng, jitters)
 
 
 def recorded_on(
@@ -257,12 +260,19 @@ def recorded_on(
     loop: Loop,
     settings: Settings,
     rng: np.random.Generator,
+    jitters: bool = False,
 ) -> World:
     """Return what is measured on a way of poses (k, 4, 4), among landmarks at ``walks`` m/s."""
     stamps_ns = np.rint(np.arange(len(poses)) * 1e9 / VELOCITY_RATE_HZ).astype(np.int64)
     # Truth is at the stamps of velocities and between them, where landmarks are seen.
     steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:])
-    between = poses[:-1] @ se3.exp(OBSERVED_AFTER_S * VELOCITY_RATE_HZ * steps)
+    share = OBSERVED_AFTER_S * VELOCITY_RATE_HZ
+    deviations = _step_deviations(steps, settings)
+    moved = share * steps
+    if jitters:  # a Brownian bridge from one velocity to the next
+        bridge = math.sqrt(share * (1.0 - share)) * deviations
+        moved = moved + bridge * rng.standard_normal(steps.shape)
+    between = poses[:-1] @ se3.exp(moved)
     between_ns = stamps_ns[:-1] + round(OBSERVED_AFTER_S * 1e9)
     order = np.argsort(np.append(stamps_ns, between_ns))
     truth = Trajectory(
@@ -270,7 +280,7 @@ def recorded_on(
     )
     events: list[Event] = []
     world = World(settings, events, truth, landmarks, walks)
-    velocities = _measured_velocities(steps, settings, rng)
+    velocities = VELOCITY_RATE_HZ * (steps + deviations * rng.standard_normal(steps.shape))
     for k, stamp_ns in enumerate(stamps_ns[:-1].tolist()):
         events.append(VelocityEvent(stamp_ns, velocities[k]))
         if k % (VELOCITY_RATE_HZ // loop.observation_rate_hz) == 0:
@@ -340,15 +350,12 @@ def _walks(loop: Loop, planar: bool, seed: int) -> FloatArray:
     return walks
 
 
-def _measured_velocities(
-    steps: FloatArray, settings: Settings, rng: np.random.Generator
-) -> FloatArray:
-    """Return the velocities of motions (k, 6), each of one period, with white noise."""
+def _step_deviations(steps: FloatArray, settings: Settings) -> FloatArray:
+    """Return by how much the motions (k, 6), each of one period, are off in velocities (k, 6)."""
     dt_s = 1.0 / VELOCITY_RATE_HZ
-    velocities = steps / dt_s
-    k = len(velocities)
+    k = len(steps)
     held = HeldVelocities(
-        velocities,
+        steps / dt_s,
         np.zeros((k, 6, 6)),
         np.zeros((k, 2), dtype=bool),
         np.full(k, dt_s),
@@ -356,8 +363,7 @@ def _measured_velocities(
         np.zeros((k, 2)),
         np.full(2, np.inf),
     )
-    variances = np.diagonal(MotionNoise(settings).covariances(held), axis1=1, axis2=2) / dt_s**2
-    return velocities + np.sqrt(variances) * rng.standard_normal(velocities.shape)
+    return np.sqrt(np.diagonal(MotionNoise(settings).covariances(held), axis1=1, axis2=2))
 
 
 def _look(

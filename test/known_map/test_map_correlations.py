@@ -449,7 +449,7 @@ class TestTags:
             G[p + stride * i + k :][:q] = np.eye(q, p)
         R = known.joint_on(axes)
         P = np.zeros((len(own) + len(R),) * 2)
-        P[: len(own), : len(own)] = own + 1e4 * G @ G.T
+        P[: len(own), : len(own)] = own + 1e6 * G @ G.T
         P[len(own) :, len(own) :] = R
         H = np.zeros((4 * k + q, len(P)))
         for i, row in enumerate(rows):
