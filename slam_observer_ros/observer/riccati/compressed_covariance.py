@@ -113,9 +113,9 @@ class CompressedCovariance(JointCovariance):
         missing = rows[self._places[rows] < 0]
         if len(missing) or len(self.active) > self._most:
             self._switch(self._chosen(rows))
-        elif self._has_moved:  # once, however often an observation is looked at
-            self._has_moved = False
+        elif self._has_moved:
             self._check_references()
+        self._has_moved = False  # once is enough, however often an observation is looked at
 
     def _check_references(self) -> None:
         """Refer to present estimates if some of those that it is the turn of are far off."""
@@ -348,31 +348,30 @@ class CompressedCovariance(JointCovariance):
         outside.begin(change)
         self._set_active(self.active[~np.isin(self.active, released)], len(self._places))
         self._following.set_slots(all_slots, self._others)
-        self._start(P[np.ix_(self._x[kept], self._x[kept])])
+        self._start(self._matrix.among(self._x[kept]))
 
     def _take_in(self, rows: IntArray) -> None:
         """Make landmarks (m,) active, too."""
         if not len(rows):
             return
-        following, P, p, first = self._following, self.P, self._p, self.first
+        following, p, first = self._following, self._p, self.first
         rows = rows[np.argsort(following.slots[rows])]
         X, among, references = following.catch_up(rows)
+        # X gets columns, of η itself, and x entries.
+        m = len(among)
+        self._matrix.insert_zeros(first, m)
+        self._matrix.append_zeros(m)
+        P = self.P
+        taken, new = first + np.arange(m), len(P) - m + np.arange(m)
         # ξ = η + T ε with x and with each other.
         T = self._all_turning(references)
         eta_to_x = X @ P[self._entries]
         to_x = eta_to_x + T @ P[:p]
         own = among + eta_to_x[:, self._entries] @ X.T + eta_to_x[:, :p] @ T.T + T @ to_x[:, :p].T
-        # X gets columns, of η itself.
-        m, size = len(own), len(P)
-        old = np.append(np.arange(first), np.arange(first, size) + m)
-        taken, new = first + np.arange(m), size + m + np.arange(m)
-        M = np.zeros((size + 2 * m,) * 2)
-        M[np.ix_(old, old)] = P
-        M[np.ix_(new, old)], M[np.ix_(old, new)] = to_x, to_x.T
-        M[np.ix_(new, new)] = symmetric(own)
-        M[new, taken] = M[taken, new] = 1.0
+        P[-m:], P[:, -m:] = to_x, to_x.T
+        P[-m:, -m:] = symmetric(own)
+        P[new, taken] = P[taken, new] = 1.0
         self._use(self.chart.with_postponed(first - self.chart.robot + m))
-        self.P = M
         self._postponed.take(np.diagonal(among))
         self._set_active(np.append(self.active, rows), len(self._places))
         following.set_slots(following.slots, self._others)
@@ -390,16 +389,13 @@ class CompressedCovariance(JointCovariance):
 
     def _start(self, P: FloatArray) -> None:
         """Let x have the covariance P from now on, and postpone what it has to do to others."""
-        size, count = len(P), self._outside.size
-        self._use(self.chart.with_postponed(count))
-        x = np.arange(size)
-        x[self.chart.robot :] += count
-        M = np.zeros((size + count,) * 2)
-        M[np.ix_(x, x)] = P
-        entries = self.chart.robot + np.arange(count)
-        M[x[:count], entries] = M[entries, x[:count]] = 1.0
-        self.P = M
+        count, robot = self._outside.size, self.chart.robot
         self._following.start(np.diagonal(P)[:count])
+        self.P = P
+        self._matrix.insert_zeros(robot, count)
+        self._use(self.chart.with_postponed(count))
+        x, entries = self._x[:count], robot + np.arange(count)
+        self.P[x, entries] = self.P[entries, x] = 1.0
 
     def _set_active(self, rows: IntArray, n: int) -> None:
         self.active, self._places = rows, np.full(n, -1)
