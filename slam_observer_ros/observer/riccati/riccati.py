@@ -32,10 +32,8 @@ from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.observer.residuals import Residuals, SeenPoints
-from slam_observer_ros.observer.riccati.compressed_covariance import (
-    BlockSize,
-    CompressedCovariance,
-)
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
+from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
