@@ -52,6 +52,7 @@ def parts(state):
         state.landmarks,
     )
     latest = history._new[-1].keyframe if history._new else None
+    noise, sensitivity, drift = history._motion or history._at_rest()
     return {
         'A': state.observer.A,
         'a': state.observer.a,
@@ -60,9 +61,9 @@ def parts(state):
         'calibration': state.filter.calibration.values,
         'factors': np.concatenate([factors._logs, factors._information.ravel(), factors.applied]),
         'shares': np.zeros(()) if factors._shares is None else factors._shares,
-        'noise': history._motion_noise,
-        'sensitivity': history._sensitivity,
-        'drift': history._drift,
+        'noise': noise,
+        'sensitivity': sensitivity,
+        'drift': drift,
         'end velocity': np.zeros(0) if state._end_velocity is None else state._end_velocity,
         'table': np.concatenate(
             [table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns]
