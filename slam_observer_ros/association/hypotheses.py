@@ -182,7 +182,7 @@ class Hypotheses:
                 variances = np.diagonal(motion.covariances.sum(axis=0))
             if state is not self.best:
                 continue
-            self._standing.moved.append((before, state.observer.A.copy()))
+            self._standing.moved.append(se3.between(before, state.observer.A))
             calibration = state.filter.calibration
             if calibration.delay_error_ns:
                 self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
@@ -251,9 +251,11 @@ class Hypotheses:
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        if len(self._all) == 1 and (outcome := _observed(self.best, event)) is not None:
-            self._some_have_ids = True
-            return outcome
+        if len(self._all) == 1:
+            outcome = usual.observe(self.best, event) or in_parts.observe(self.best, event)
+            if outcome is not None:
+                self._some_have_ids = True
+                return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         if self.best.filter.joint is None:
@@ -339,7 +341,9 @@ class Hypotheses:
         for number, hypothesis in enumerate(self._all):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
-            used = None if is_alone else _observed(state, event, is_weighed=True)
+            used = None
+            if not is_alone:
+                used = usual.observe(state, event, True) or in_parts.observe(state, event, True)
             meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
             for taken in meanings or interpretations(
                 state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
@@ -355,12 +359,6 @@ class Hypotheses:
             ids = hypothesis.state.landmarks.ids
             self._next_id = max(self._next_id, int(np.max(ids[is_automatic(ids)], initial=0)) + 1)
         return self._next_id + np.arange(m)
-
-
-def _observed(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
-    """Let a state use an observation, or a part of it, as usual; None where it is not."""
-    outcome = usual.observe(state, event, is_weighed)
-    return in_parts.observe(state, event, is_weighed) if outcome is None else outcome
 
 
 def _are_one(child: _Child, other: _Child) -> bool:

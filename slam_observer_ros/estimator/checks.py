@@ -340,14 +340,18 @@ def usable_points(
     if event.orientations is not None:
         used = so3.exact(event.orientations) if filter_.estimates_orientations else None
         event = replace(event, orientations=used)
+    ids = event.ids.tolist()
+    are_usual = 0 < len(set(ids)) == len(ids) <= MAX_WEIGHED
+    if are_usual and min(ids) >= 0 and max(ids) < FIRST_AUTOMATIC_ID:
+        return event
     if (impossible := event.ids == IMPOSSIBLE_ID).any():
         warnings.warn('impossible_id', count=int(np.sum(impossible)))
         counts['impossible_id'] += int(np.sum(impossible))
         event = event.select(~impossible)
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
-        ids = listed(event.ids[reserved].tolist())
-        warnings.warn('reserved_id', ids=ids, first=FIRST_AUTOMATIC_ID, last=LAST_AUTOMATIC_ID)
+        named = listed(event.ids[reserved].tolist())
+        warnings.warn('reserved_id', ids=named, first=FIRST_AUTOMATIC_ID, last=LAST_AUTOMATIC_ID)
         counts['reserved_id'] += int(np.sum(reserved))
         event = event.select(~reserved)
     if repeated_ids := event.repeated_ids():  # nobody knows which of the points is right

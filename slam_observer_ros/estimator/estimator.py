@@ -694,7 +694,7 @@ class Estimator:
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
         warnings.large_map(len(state.landmarks), limit, is_dense)
-        distance_m = np.abs(state.observer.A[:3, 3]).max()
+        distance_m = math.hypot(*state.observer.A[:3, 3].tolist())
         if not distance_m <= DIVERGED_M:  # nor is what is no number
             self._start_again(distance_m)
 

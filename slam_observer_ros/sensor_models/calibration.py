@@ -62,6 +62,7 @@ class Calibration:
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._nominal = stated_of_velocity(settings)
         self._all: FloatArray = self._nominal.copy()
+        self._values: FloatArray | None = None  # as asked for since the last change
         # τ; where it is negative the latest velocity is held for longer.
         self.delay_ns = to_ns(settings.velocity_delay)
         self.sensors: dict[str, SensorCalibration] = {}
@@ -92,7 +93,7 @@ class Calibration:
         """Append what is estimated of the sensor of a new frame."""
         number, variances = len(self.sensors), self._sensor_variances
         sensor = SensorCalibration(frame, number, self._stated, self._of_sensor, variances)
-        self.sensors[frame] = sensor
+        self.sensors[frame], self._values = sensor, None
         self.count += len(sensor.estimated)
         self._set_variances(np.append(self.initial_variances, sensor.variances))
         return sensor
@@ -100,11 +101,11 @@ class Calibration:
     @property
     def values(self) -> FloatArray:
         """(c,) estimates: scale factors 1 + s, biases b, the delay τ in seconds; then sensors'."""
-        values: FloatArray = self._all[self._estimated]
-        if not self.sensors:
-            return values
-        sensors = self.sensors.values()
-        return np.concatenate([values, *(part.values[part.estimated] for part in sensors)])
+        if self._values is None:
+            of_sensors = [part.values[part.estimated] for part in self.sensors.values()]
+            self._values = np.concatenate([self._all[self._estimated], *of_sensors])
+            self._values.setflags(write=False)
+        return self._values
 
     @property
     def calibrates_sensors(self) -> bool:
@@ -237,6 +238,7 @@ class Calibration:
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
+        self._values = None
         self._all[self._estimated] += change[: self.of_velocity]
         for sensor in self.sensors.values():
             sensor.shift(change[self.columns(sensor)])
