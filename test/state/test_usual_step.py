@@ -55,9 +55,8 @@ def parts(state):
     noise, sensitivity, drift = history._motion or history._at_rest()
     return {
         'A': state.observer.A,
-        'a': state.observer.a,
         'P': state.filter.joint.P,
-        'map': state.filter.points,
+        'map': state.filter.points,  # not â_i alone: it rounds as these do
         'calibration': state.filter.calibration.values,
         'factors': np.concatenate([factors._logs, factors._information.ravel(), factors.applied]),
         'shares': np.zeros(()) if factors._shares is None else factors._shares,
