@@ -62,6 +62,7 @@ settings.load_profile('suite')
 
 LONGEST = (
     'test_cli_replay',
+    'test_real_recordings',
     'test_large_maps',
     'test_batch',
     'test_association',

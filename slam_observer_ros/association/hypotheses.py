@@ -20,17 +20,19 @@ from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     as_its_ids_say,
+    consistent,
     Interpretation,
     interpretations,
     is_ambiguous,
     may_relabel,
+    noted,
 )
 from slam_observer_ros.association.joint_compatibility import (
     pruning_cost,
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.slip import Contradictions
+from slam_observer_ros.association.slip import RejectedLandmarks
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
@@ -82,7 +84,7 @@ class Hypotheses:
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
-        self._contradictions = Contradictions()
+        self._rejected = RejectedLandmarks()
         self._new_landmarks = NewLandmarks()
         self._standing = Standing()
         self._velocities: VelocityHistory | None = None  # along which they were moved
@@ -203,7 +205,7 @@ class Hypotheses:
         """Let all hypotheses go on from where they are at any other time."""
         for hypothesis in self._all:
             hypothesis.state.clear_time()
-        self._contradictions.clear()
+        self._rejected.clear()
         self._standing.clear_time()
 
     def forget(self, landmark_id: int) -> bool:
@@ -278,7 +280,7 @@ class Hypotheses:
     def _observe_alone(self, event: ObservationEvent) -> Outcome:
         """Use an observation that can't be weighed: of a state without a joint covariance."""
         matched = match(self.best, event)
-        if self._contradictions.resolve(self.best, matched):
+        if self._rejected.explain_by_slip(self.best, matched):
             matched = match(self.best, event)
         return step(self.best, matched)
 
@@ -321,6 +323,7 @@ class Hypotheses:
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
+        hypothesis.verdicts = noted(hypothesis.verdicts, state, taken, event)
         if (event.ids == UNKNOWN_ID).any():
             hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
@@ -345,9 +348,13 @@ class Hypotheses:
             if not is_alone:
                 used = usual.observe(state, event, True) or in_parts.observe(state, event, True)
             meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
-            for taken in meanings or interpretations(
+            found = meanings or interpretations(
                 state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
-            ):
+            )
+            if not is_alone:
+                before = hypothesis.verdicts
+                found = consistent(before, state, found, event) or found * (number == 0)
+            for taken in found:
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)

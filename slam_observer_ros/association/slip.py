@@ -1,7 +1,7 @@
 """A robot that is not where odometry has it: its wheels slipped, or someone carried it.
 
 Filters with a joint covariance weigh that as a hypothesis. For all other filters
-:class:`Contradictions` decides whether the pose is wrong, as observation after observation
+:class:`RejectedLandmarks` decides whether the pose is wrong, as observation after observation
 contradicts it: a rejected landmark may have moved, and a rejected observation may be garbled. The
 pose is wrong if three things come together: all landmarks of an observation are rejected, other
 landmarks were rejected before, and a single motion of the robot explains all of them.
@@ -9,7 +9,7 @@ landmarks were rejected before, and a single motion of the robot explains all of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -116,25 +116,18 @@ AGREEMENT = 3.0
 """Standard deviations within which earlier landmarks must be where a corrected pose has them."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Rejected:
-    """Where a landmark seemed to be when it was rejected."""
-
-    position: FloatArray  # (3,) metres, reference frame
-    covariance: FloatArray  # (3, 3) of the point, body frame, m²
-
-
-class Contradictions:
-    """The landmarks that were rejected since a landmark last passed the gate, by id."""
+class RejectedLandmarks:
+    """Landmarks that were rejected since one last passed the gate: a slip may explain them all."""
 
     def __init__(self) -> None:
-        self._rejected: dict[int, _Rejected] = {}
+        # By id, where each seemed to be: (3,) metres, reference frame; (3, 3) m², body frame.
+        self._rejected: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     def clear(self) -> None:
         """Forget what was rejected."""
         self._rejected.clear()
 
-    def resolve(self, state: State, matched: MatchedObservation) -> bool:
+    def explain_by_slip(self, state: State, matched: MatchedObservation) -> bool:
         """Let the robot have slipped if that explains all rejections; return whether it does.
 
         The observation has to be matched again then.
@@ -161,14 +154,15 @@ class Contradictions:
         trial.filter.correct(match(trial, matched.event).residuals)
         ids = np.array(others)
         rows = trial.landmarks.rows_of(ids)
-        rejected = [self._rejected[i] for i in others]
+        rejected = zip(*(self._rejected[i] for i in others), strict=True)
+        positions, covariances = (np.array(each) for each in rejected)
         # The earlier points as they would be seen now, with the same error of the pose.
         back = se3.inverse(state.observer.A)
         seen = replace(
             matched.known,
             ids=ids,
-            points=se3.transform(back, np.array([other.position for other in rejected])),
-            covariances=np.array([other.covariance for other in rejected]),
+            points=se3.transform(back, positions),
+            covariances=covariances,
             velocities=None,
             sensor=None,
             sensed=None,
@@ -176,7 +170,7 @@ class Contradictions:
         if (rows < 0).any():  # one was forgotten meanwhile
             return False
         trial.filter.expected_points(rows)
-        residuals = residuals_of(trial, seen, rows, np.array([o.covariance for o in rejected]))
+        residuals = residuals_of(trial, seen, rows, covariances)
         return bool((trial.filter.distances(residuals) <= AGREEMENT).all())
 
     def _note(self, state: State, matched: MatchedObservation) -> None:
@@ -186,4 +180,4 @@ class Contradictions:
         for landmark_id, position, covariance in zip(
             matched.known.ids.tolist(), positions, covariances, strict=True
         ):
-            self._rejected[landmark_id] = _Rejected(position, covariance)
+            self._rejected[landmark_id] = position, covariance

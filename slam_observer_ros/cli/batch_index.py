@@ -240,7 +240,9 @@ def _runs_table(
         rows.append(
             [
                 run['recording'].removeprefix(folder),
-                Links([(kind, _address(run[kind])) for kind in FILES if run.get(kind)]),
+                Links(
+                    [(kind, quote(run[kind], errors='replace')) for kind in FILES if run.get(kind)]
+                ),
                 *(_text(run, name) for name in names),
                 run[POINTS_USED],
                 *(run.get(name) for name in figures),
@@ -257,7 +259,3 @@ def _folder_of_all(runs: Sequence[Line]) -> str:
     folders = [run['recording'].rpartition('/')[0].split('/') for run in runs]
     shared = os.path.commonprefix(folders)  # noqa: RUF071 (names of folders, not characters)
     return '/'.join([*shared, '']) if shared else ''
-
-
-def _address(file: str) -> str:
-    return quote(file, errors='replace')

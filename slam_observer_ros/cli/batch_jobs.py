@@ -76,15 +76,13 @@ def find_recordings(patterns: Iterable[str]) -> list[Path]:
     """Return the recordings that paths and patterns name, each once; ``**`` is any folders."""
     found: dict[Path, None] = {}
     for pattern in patterns:
-        paths = [pattern] if Path(pattern).exists() else _glob(pattern)
+        paths = [pattern]
+        if not Path(pattern).exists():
+            paths = glob.glob(pattern, recursive=True)  # noqa: PTH207 (it may begin with /)
         if not paths:
             raise UsageError(f"no file is named '{pattern}'")
         found |= dict.fromkeys(Path(path) for path in sorted(paths))
     return list(found)
-
-
-def _glob(pattern: str) -> list[str]:
-    return glob.glob(pattern, recursive=True)  # noqa: PTH207 (it may begin with /)
 
 
 def grid_points(texts: Iterable[str]) -> list[Point]:

@@ -23,7 +23,7 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.cli.replay_outcome import ReplayOutcome
 from slam_observer_ros.cli.replay_request import Records
-from slam_observer_ros.common.errors import EvaluationError, SlamObserverError, UsageError
+from slam_observer_ros.common.errors import SlamObserverError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import nees_over_time, shape_covariances
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
@@ -141,7 +141,7 @@ def write_files(
             args.rerun or None,
             lambda path: _show_in_rerun(title, outcome, path),
         ),
-        ('figures', args.plot, lambda path: _draw_figures(args, outcome, path)),
+        ('figures', args.plot, lambda path: _draw(args, outcome, path)),
     )
     written: dict[str, Path] = {} if args.mcap is None else {'recording': args.mcap}
     errors: list[str] = []
@@ -180,37 +180,29 @@ def write_report_of(
     """Write the page that shows a run, with the lines of the table that is printed."""
     from slam_observer_ros.report.page import write_report  # which few replays need
 
-    if outcome.whole_run is None:
-        raise EvaluationError('nothing was recorded that could be shown')
     logged = {finding.text() for finding in outcome.findings}
     warnings = [warning for warning in outcome.warnings if warning not in logged]
-    write_report(path, outcome.whole_run, title, summary, outcome.findings, warnings)
+    write_report(path, outcome.shown, title, summary, outcome.findings, warnings)
 
 
 def _show_in_rerun(title: str, outcome: ReplayOutcome, path: Path | None) -> None:
     """Write a file for Rerun, or open its viewer if that is None."""
     from slam_observer_ros.report.rerun_log import show_in_rerun  # which only some have
 
-    if outcome.whole_run is None:
-        raise EvaluationError('nothing was recorded that could be shown')
-    show_in_rerun(outcome.whole_run, title, path)
+    show_in_rerun(outcome.shown, title, path)
 
 
-def _draw_figures(args: argparse.Namespace, outcome: ReplayOutcome, directory: Path) -> None:
-    with filled_directory(directory, figure_files(args, FIGURES)) as unfinished:
-        _draw(outcome, unfinished, args.plot_format)
-
-
-def _draw(outcome: ReplayOutcome, directory: Path, suffix: str) -> None:
-    """Draw the figures into a directory that is there, as files of one kind."""
+def _draw(args: argparse.Namespace, outcome: ReplayOutcome, directory: Path) -> None:
     from slam_observer_ros.evaluation.replay_plots import plot_residuals
 
-    _draw_map(outcome, directory / f'map.{suffix}')
-    _draw_errors(outcome, directory / f'errors.{suffix}')
-    if outcome.whole_run is not None:
+    names = figure_files(args, FIGURES)
+    with filled_directory(directory, names) as unfinished:
+        of_map, of_errors, of_residuals = (unfinished / name for name in names)
+        _draw_map(outcome, of_map)
+        _draw_errors(outcome, of_errors)
         plot_residuals(
-            directory / f'residuals.{suffix}',
-            outcome.whole_run.innovations,
+            of_residuals,
+            outcome.shown.innovations,
             outcome.result.estimator.settings,
             outcome.dropped,
             outcome.events,

@@ -9,7 +9,7 @@ import logging
 import math
 from pathlib import Path
 
-from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.common.findings import Finding, found, Level
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
@@ -98,6 +98,13 @@ class ReplayOutcome:
             'messages': self.loss.message_count,
             'malformed': self.unused[MALFORMED],
         }
+
+    @property
+    def shown(self) -> ReportedRun:
+        """What was recorded to be shown; an EvaluationError is raised if nothing was."""
+        if self.whole_run is None:
+            raise EvaluationError('nothing was recorded that could be shown')
+        return self.whole_run
 
     @property
     def trajectory(self) -> Trajectory:

@@ -18,7 +18,6 @@ from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_maps
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
@@ -46,7 +45,11 @@ def replayed(request: ReplayRequest, *, shows_progress: bool = True) -> tuple[Re
             "No map is loaded, so localization_mode '%s' has no effect (use --load-map).",
             request.settings.localization_mode,
         )
-    maps = [] if request.load_map is None else read_maps(request.load_map)
+    maps: Sequence[LandmarkMap] = ()
+    if request.load_map is not None:
+        from slam_observer_ros.known_map.map_file import read_maps  # which few runs need
+
+        maps = read_maps(request.load_map)
     outcome = _replay(request, maps, shows_progress)
     return outcome, _frame_of_outputs(request.inputs, maps)
 

@@ -29,9 +29,8 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import are_covariances, transpose
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
 from slam_observer_ros.known_map.map_correlations import check_joint
-from slam_observer_ros.known_map.map_file import MAX_NUMBER
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
 from slam_observer_ros.state.landmark_table import LandmarkTable

@@ -1,8 +1,4 @@
-"""Where a robot is in a map by landmarks without ids, and whether it is there no longer.
-
-It is found by how these lie to each other, and was carried off where points are not where the map
-has landmarks.
-"""
+"""Finds the pose in a map by landmarks without ids: by how they lie to each other."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ import numpy as np
 
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.constellation import find_places, MAX_LOOKS
 from slam_observer_ros.known_map.distances import MappedLandmarks
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -195,40 +191,3 @@ class _SearchedMap:
 def _largest_mass(places: Places) -> float:
     """Return ln of the mass of the most likely place."""
     return places.all[0].log_mass if places.all else -math.inf
-
-
-MISSING, EXPLAINED = 1.95, -1.1
-"""ln of how much likelier a point is where the robot is lost, if the map does not explain it, and
-if it does: then 7 points in 10 are of nothing known, else 1 in 10.
-"""
-
-MAX_STEP = 3.0
-"""What an observation may say at most: its points have errors in common."""
-
-LIMIT = 8.0
-"""Sum at which the robot is lost."""
-
-
-class Unexplained:
-    """A cumulative sum of what observations say of a robot that was carried (E. S. Page, 1954)."""
-
-    def __init__(self) -> None:
-        self._sum = 0.0
-
-    def is_too_much(self, state: State, event: ObservationEvent, missed: float) -> bool:
-        """Add an observation, already used; return whether the pose must be wrong by now.
-
-        Where the map grows points of nothing known are no sign of that, unless in place of them
-        other landmarks should have been seen: ``missed``.
-        """
-        if not (event.ids == UNKNOWN_ID).any():
-            return False
-        landmarks = state.landmarks
-        is_seen = (landmarks.last_seen_ns == event.stamp_ns) & ~landmarks.tentative
-        explained = int(np.count_nonzero(is_seen))
-        missing: float = max(0, len(event.ids) - explained)
-        if state.is_mapping:
-            missing = min(missing, missed)
-        step = MISSING * missing + EXPLAINED * explained
-        self._sum = max(0.0, self._sum + min(max(step, -MAX_STEP), MAX_STEP))
-        return self._sum > LIMIT

@@ -10,6 +10,9 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks, part_of_joint, tags_among
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 
+MAX_NUMBER = 1e12
+"""Metres; nothing larger is meant seriously, and its square still has all digits."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:

@@ -6,19 +6,22 @@ from collections import Counter
 from collections.abc import Sequence
 import logging
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.known_map.finder import Finder, Unexplained
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import pose_by_tag, TagPose
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
-from slam_observer_ros.known_map.places import Place
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Outcome
+
+if TYPE_CHECKING:
+    from slam_observer_ros.known_map.finder import Finder
+    from slam_observer_ros.known_map.places import Place
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +42,17 @@ ROUGH_STD = np.repeat([0.5, 1.0], 3)
 """Standard deviations of a given pose, rad and m, beyond which points can't be matched by where
 they are: the map is then searched as if the pose was not known at all.
 """
+
+MISSING, EXPLAINED = 1.95, -1.1
+"""ln of how much likelier a point is where the robot is lost, if the map does not explain it, and
+if it does: then 7 points in 10 are of nothing known, else 1 in 10.
+"""
+
+MAX_STEP = 3.0
+"""What an observation may say at most: its points have errors in common."""
+
+LIMIT = 8.0
+"""Sum at which the robot is lost."""
 
 
 class Localiser:
@@ -179,6 +193,8 @@ class Localiser:
         if not len(self.maps[0].ids) or state.filter.joint is None:
             return
         if self._finder is None:
+            from slam_observer_ros.known_map.finder import Finder  # which few runs need
+
             self._finder = Finder(self.maps, state, self._rough)
         found, places = self._finder.find(state), self._finder.places
         if found is not None and places is not None and enter_map(state, *found):
@@ -286,3 +302,28 @@ class PoseTrial:
         self._for += int(accepted > 0 and accepted >= rejected)
         self._against += int(rejected > accepted)
         return self._against >= often and self._against > self._for
+
+
+class Unexplained:
+    """A cumulative sum of what observations say of a robot that was carried (E. S. Page, 1954)."""
+
+    def __init__(self) -> None:
+        self._sum = 0.0
+
+    def is_too_much(self, state: State, event: ObservationEvent, missed: float) -> bool:
+        """Add an observation, already used; return whether the pose must be wrong by now.
+
+        Where the map grows points of nothing known are no sign of that, unless in place of them
+        other landmarks should have been seen: ``missed``.
+        """
+        if not (event.ids == UNKNOWN_ID).any():
+            return False
+        landmarks = state.landmarks
+        is_seen = (landmarks.last_seen_ns == event.stamp_ns) & ~landmarks.tentative
+        explained = int(np.count_nonzero(is_seen))
+        missing: float = max(0, len(event.ids) - explained)
+        if state.is_mapping:
+            missing = min(missing, missed)
+        step = MISSING * missing + EXPLAINED * explained
+        self._sum = max(0.0, self._sum + min(max(step, -MAX_STEP), MAX_STEP))
+        return self._sum > LIMIT

@@ -16,10 +16,7 @@ from scipy.linalg import cholesky
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry.matrices import mahalanobis
-from slam_observer_ros.known_map.constellation import find_places
-from slam_observer_ros.known_map.distances import MappedLandmarks
 from slam_observer_ros.known_map.merging import without_frame
-from slam_observer_ros.known_map.places import Anywhere, Constellation, Near
 from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.state import State
 
@@ -196,6 +193,10 @@ def _within_reach(state: State, new: IntArray, old: IntArray) -> IntArray:
 
 def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray] | None:
     """Return which old landmarks (q,) are certainly which new ones (q,), if that is so."""
+    from slam_observer_ros.known_map.constellation import find_places  # which few runs need
+    from slam_observer_ros.known_map.distances import MappedLandmarks
+    from slam_observer_ros.known_map.places import Anywhere, Constellation, Near
+
     P = state.filter.joint_covariance(np.append(new, old))
     if P is None:
         return None

@@ -24,6 +24,7 @@ import zlib
 import numpy as np
 
 from slam_observer_ros.common.errors import MapError, shown
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry.matrices import (
     COVARIANCE_ROUNDING,
@@ -50,12 +51,7 @@ def as_lines(joint: FloatArray | None, landmarks: Sequence[Mapping[str, Any]]) -
     if joint is None:
         return []
     if len(landmarks) > MAX_CORRELATED:
-        logger.warning(
-            'Correlations between %d landmarks are not saved, more than %d are too many: where '
-            'the map is loaded their errors count as independent.',
-            len(landmarks),
-            MAX_CORRELATED,
-        )
+        logger.warning('%s', found('left_out_correlations', count=len(landmarks)))
         return []
     triangle = joint[np.tril_indices(len(joint))].astype('<f8')
     # Runs are what there is to find, those of zeros in planar maps: at a third of the time.

@@ -43,16 +43,13 @@ from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import are_covariances
 from slam_observer_ros.known_map import map_correlations
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
 from slam_observer_ros.settings.estimator_settings import Settings
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
 
 _MAX_INT64 = 2**63 - 1
-
-MAX_NUMBER = 1e12
-"""Metres; nothing larger is meant seriously, and its square still has all digits."""
 
 _ROUNDED_NORM = 1e-2
 """By how much the norm of a quaternion that somebody wrote down may miss being one."""

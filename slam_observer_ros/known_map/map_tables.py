@@ -19,7 +19,7 @@ from slam_observer_ros.common.errors import MapError, shown
 from slam_observer_ros.common.files import read_text
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.known_map.map_file import MAX_NUMBER
+from slam_observer_ros.known_map.landmark_map import MAX_NUMBER
 
 NO_ORIENTATION = np.zeros((3, 3))
 

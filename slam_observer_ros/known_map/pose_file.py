@@ -14,10 +14,10 @@ from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.known_map.landmark_map import MAX_NUMBER
 
 FORMAT = 'slam_observer_ros pose'
 MAX_BYTES = 10_000
-MAX_NUMBER = 1e12
 SIZES = {'position': 3, 'orientation': 4, 'covariance': 36}
 
 

@@ -16,8 +16,6 @@ from slam_observer_ros.common.errors import message_of, RecordingError, YamlErro
 from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.recording.mcap_source import McapSource
-from slam_observer_ros.recording.salvage import MendedSource, SalvagedSource
-from slam_observer_ros.recording.salvage_formats import SCANS
 from slam_observer_ros.recording.sources import (
     BagSource,
     Loss,
@@ -198,6 +196,8 @@ def _open_mcap(path: Path) -> tuple[MessageSource, str | None]:
 
 
 def _open_bag(path: Path) -> tuple[MessageSource, str | None]:
+    from slam_observer_ros.recording.salvage import MendedSource  # which MCAP files do without
+
     try:
         return MendedSource(BagSource(path), lambda: _salvaged(path)), None
     except RecordingError as error:
@@ -207,11 +207,14 @@ def _open_bag(path: Path) -> tuple[MessageSource, str | None]:
         raise RecordingError(f'{error}; {_NONE_LEFT}') from error
 
 
-def _salvaged(path: Path) -> SalvagedSource:
+def _salvaged(path: Path) -> MessageSource:
+    from slam_observer_ros.recording.salvage import SalvagedSource
+    from slam_observer_ros.recording.salvage_formats import SCANS  # which few files need
+
     return SalvagedSource(path, SCANS[path.suffix])
 
 
-def _left_out(path: Path, source: McapSource | SalvagedSource) -> str | None:
+def _left_out(path: Path, source: MessageSource) -> str | None:
     """Say what of a file is not read; None if all of it is."""
     loss = source.loss
     if loss.byte_count or loss.is_cut_off:
