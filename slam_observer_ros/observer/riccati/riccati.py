@@ -37,16 +37,13 @@ from slam_observer_ros.observer.riccati.compressed_covariance import CompressedC
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
-from slam_observer_ros.observer.robust import observation_weights
+from slam_observer_ros.observer.robust import AT_ONCE, observation_weights
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-AT_ONCE = 32
-"""Points that are used at once; each block of so many is judged by what those before it left."""
 
 MERGER_ROUNDS = 4
 """How often a merger is linearised; the last times it hardly changes."""
