@@ -185,7 +185,7 @@ class Hypotheses:
             if state is not self.best:
                 continue
             self._standing.moved.append(se3.between(before, state.observer.A))
-            calibration = state.filter.calibration
+            calibration = state.calibration
             if calibration.delay_error_ns:
                 self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
         if len(self._standing.moved) > MAX_MOTIONS:
@@ -195,10 +195,10 @@ class Hypotheses:
     @property
     def calibration(self) -> list[CalibrationEstimate]:
         """Scale, bias and delay of the velocity in the most likely state."""
-        known, initial_s = self.best.filter, self.best.settings.velocity_delay_stddev
+        best, initial_s = self.best, self.best.settings.velocity_delay_stddev
         return [
             self._delay_evidence.corrected(part, initial_s) if part.name == DELAY_NAME else part
-            for part in known.calibration.estimates(known.calibration_variances)
+            for part in best.calibration.estimates(best.gains.calibration_variances)
         ]
 
     def clear_time(self) -> None:
@@ -234,7 +234,7 @@ class Hypotheses:
     def _judge(self, event: ObservationEvent) -> None:
         """Stop where the wheels spin, and give up landmarks that the robot carries."""
         standing, best = self._standing, self.best
-        if not best.filter.has_joint_covariance or self._velocities is None:
+        if best.errors is None or self._velocities is None:
             return
         was_slipping, were_carried = standing.slip is not None, standing.carried
         lost = standing.note(best, event, self._velocities)
@@ -260,7 +260,7 @@ class Hypotheses:
                 return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        if self.best.filter.joint is None:
+        if self.best.errors is None:
             return self._observe_alone(event)
         if len(self._all) == 1 and not unknown:
             matched = match(self.best, event)
@@ -398,7 +398,7 @@ def are_one(
             rows, other_rows = state.landmarks.rows_of(ids), other.landmarks.rows_of(ids)
             if (rows < 0).any() or (other_rows < 0).any():
                 return False
-            own, others = state.filter.world_points, other.filter.world_points
+            own, others = state.observer.world_points, other.observer.world_points
             shifts.append(own[rows] - others[other_rows])
     distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
     return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)

@@ -162,7 +162,7 @@ class Visibility:
         landmarks = state.landmarks
         is_numbered, everything = is_automatic(landmarks.ids), np.arange(len(landmarks))
         seen = landmarks.last_seen_ns == event.stamp_ns
-        in_view = seen | self._field_of_view.contains(state.filter.expected_points(everything))
+        in_view = seen | self._field_of_view.contains(state.observer.body_points(everything))
         if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
             state.counts['unexpected_place'] += 1
         # Those without an id of their own: what it costs to have missed them, and their counts.

@@ -240,7 +240,7 @@ def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
 
 def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
     """Return which points (m,) the gate rejects."""
-    return np.asarray(state.filter.distances(residuals) > state.settings.rejection_threshold)
+    return np.asarray(state.gains.distances(residuals) > state.settings.rejection_threshold)
 
 
 def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:
@@ -249,7 +249,7 @@ def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) 
     far = are_far(sensor_distances, gate)
     if far.any():
         r, noise = residuals.on(state.axes)
-        far &= far_from_the_others(r, state.filter.predicted(residuals)[1], noise, gate)
+        far &= far_from_the_others(r, state.known_errors.predicted(residuals)[1], noise, gate)
     return far
 
 

@@ -422,7 +422,7 @@ def _product(moved: list[FloatArray]) -> FloatArray:
 
 def _motion_noise(state: State, pairs: _Pairs, velocities: VelocityHistory) -> FloatArray:
     """Return the covariance (p, p) of the motion between them, with that of its bias."""
-    calibration, end_ns = state.filter.calibration, pairs.event.stamp_ns
+    calibration, end_ns = state.calibration, pairs.event.stamp_ns
     # What led there so long ago that it is forgotten was off by as much.
     since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)
     start = state.observer.A.dot(se3.inverse(pairs.motion))
@@ -431,7 +431,7 @@ def _motion_noise(state: State, pairs: _Pairs, velocities: VelocityHistory) -> F
     F = longer * motion.sensitivity
     # As it is stated: what slips and carried landmarks have added to it is no reason to wait.
     noise = longer / max(1.0, state.motion_noise.factors.applied.max()) * motion.noise
-    total: FloatArray = noise + (F * state.filter.calibration_variances) @ F.T
+    total: FloatArray = noise + (F * state.gains.calibration_variances) @ F.T
     return total
 
 
@@ -445,7 +445,7 @@ def take_back(state: State, lost: Lost) -> None:
         covariances=block_diag(np.outer(turn, turn), np.outer(way, way))[None],
         duration_s=0.0,
         at_ends=None,
-        calibration=state.filter.calibration,
+        calibration=state.calibration,
         is_slip=True,
     )
     state.propagate(motion)

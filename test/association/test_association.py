@@ -40,7 +40,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.designs import make_filter
+from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.recording.mrclam import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
@@ -671,8 +671,8 @@ def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_be
 
 def state_of(landmarks, points):
     """A state with these landmarks (n, 3), of which the table says what was seen of them."""
-    state = State(make_filter(PLANAR, np.eye(4)), PLANAR)
-    state.filter.add_known(KnownLandmarks(points, np.tile(np.eye(3), (len(points), 1, 1))))
+    state = State(make_gains(PLANAR, np.eye(4)), PLANAR)
+    state.gains.add_known(KnownLandmarks(points, np.tile(np.eye(3), (len(points), 1, 1))))
     state.landmarks = landmarks
     return state
 
@@ -772,7 +772,7 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
 
 def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved_on():
     """The further the robot goes, the further apart are states that differ in their heading."""
-    hypotheses = Hypotheses(State(make_filter(PLANAR, np.eye(4)), PLANAR))
+    hypotheses = Hypotheses(State(make_gains(PLANAR, np.eye(4)), PLANAR))
     hypotheses._all.append(replace(hypotheses._all[0].copy(), cost=1.0))
     for hypothesis, yaw_rad in zip(hypotheses._all, [0.0, 0.4], strict=True):
         hypothesis.state.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
@@ -786,7 +786,7 @@ def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved
 
 def test_settings_and_jumps_of_the_clock_are_of_all_states_that_are_followed():
     settings = LiveSettings.of(Settings())
-    hypotheses = Hypotheses(State(make_filter(settings, np.eye(4)), settings))
+    hypotheses = Hypotheses(State(make_gains(settings, np.eye(4)), settings))
     hypotheses._all.append(hypotheses._all[0].copy())
     settings.follow(replace(settings, huber_threshold=3.0))
     assert [hypothesis.state.settings.huber_threshold for hypothesis in hypotheses._all] == [3, 3]
@@ -802,7 +802,7 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     poses = se3.exp(rng.normal(scale=[0.3] * 3 + [2.0] * 3, size=(3, 6)))
     roots = 0.1 * rng.normal(size=(3, 6, 6))
     covariances, costs = roots @ roots.swapaxes(1, 2), np.array([0.0, 1.0, 3.0])
-    hypotheses = Hypotheses(State(make_filter(settings, np.eye(4)), settings))
+    hypotheses = Hypotheses(State(make_gains(settings, np.eye(4)), settings))
     first = hypotheses._all[0]
     hypotheses._all = [replace(first.copy(), cost=cost) for cost in costs.tolist()]
     for hypothesis, pose, covariance in zip(hypotheses._all, poses, covariances, strict=True):

@@ -14,12 +14,12 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric
-from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.arrays import FilterArrays
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
-from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -44,7 +44,7 @@ class ActiveLandmarks(JointCovariance):
     active: IntArray
     is_dense = False
 
-    def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
+    def __init__(self, dense: JointCovariance, observer: FilterArrays, size: BlockSize) -> None:
         vars(self).update(vars(dense))
         self._form, self._observer, self._size = copy(dense), observer, size
         self._form._matrix = SymmetricMatrix(self.of_robot)
@@ -53,11 +53,12 @@ class ActiveLandmarks(JointCovariance):
         self._set_active(np.arange(n), n)
         self._following = FollowingLandmarks(self.chart, observer)
         self._checks, self._has_moved, self._most = 0, False, size.most
+        observer.postponed = self
 
-    def copy(self, observer: Observer) -> Self:
+    def copy(self, observer: FilterArrays) -> Self:
         """Return an independent copy, which shares what takes much memory until it changes."""
         other = super().copy(observer)
-        other._observer = observer
+        other._observer, observer.postponed = observer, other
         other._following = self._following.copy(observer)
         return other
 
@@ -137,7 +138,8 @@ class ActiveLandmarks(JointCovariance):
         """Return the landmarks to be active when ``rows`` (m,) are seen."""
         kept = max(self._size.kept, self._size.kept_per_seen * len(rows))
         # But landmarks that are just being added; a postponed shift makes no difference here.
-        arms = self._observer.points[: len(self._places)] - self._observer.A[:3, 3]
+        observer, n = self._observer, len(self._places)
+        arms = observer.y_ref[:n] + observer.a[:n] - observer.A[:3, 3]
         distances = np.einsum('ij,ij->i', arms, arms)
         near = np.argpartition(distances, min(kept, len(arms)) - 1)[:kept]
         wanted = np.union1d(rows, near)
@@ -166,7 +168,7 @@ class ActiveLandmarks(JointCovariance):
         all_slots[new] = outside.new_slots(len(new))
         released = released[np.argsort(all_slots[released])]
         columns = self.chart.of_landmarks(self._places[released])
-        points = self._observer.points[released]
+        points = self._observer.y_ref[released] + self._observer.a[released]
         # η = ξ − T ε with x and with each other.
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]

@@ -18,9 +18,9 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.chart import sheared
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.active_landmarks import ActiveLandmarks
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
-from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
 
 class CompressedCovariance(ActiveLandmarks):
@@ -29,14 +29,10 @@ class CompressedCovariance(ActiveLandmarks):
     @property
     def references(self) -> FloatArray:
         """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
-        points = self._observer.points
+        points = self._observer.y_ref + self._observer.a
         for view in self._following.views(self._others):
             points[view.rows] = view.references
         return points
-
-    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
-        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
-        return a + self.postponed_shifts(rows)
 
     def postponed_shifts(self, rows: IntArray) -> FloatArray:
         """Return how far the observer has yet to move landmarks (m, 3), metres."""
@@ -117,7 +113,7 @@ class CompressedCovariance(ActiveLandmarks):
         return self.marginal(every).of_landmarks(at, points, of_tags)
 
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
+        """Return what orientations ``B`` (m, 3, 3) of tags are with all that is postponed."""
         every = np.tile(np.eye(3), (len(self._places), 1, 1))
         for view in self._following.views(np.unique(rows[self._places[rows] < 0])):
             every[view.rows] = view.turns
@@ -143,7 +139,7 @@ class CompressedCovariance(ActiveLandmarks):
         """Return the same with all landmarks in P, which the observer has moved."""
         self._apply()
         joint = self.marginal(np.arange(len(self._places)))
-        self.P = joint.P
+        self.P, self._observer.postponed = joint.P, None
         joint._matrix = self._matrix
         return joint
 
