@@ -36,7 +36,7 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.matching import sensitivity
@@ -82,13 +82,13 @@ def find_assignments(
     axes, m = state.axes, len(event.ids)
     seen = _Points(state, event)
     at, rows = _candidates(state, index, seen)
-    residuals = _as_residuals(state.filter, seen, at, rows)
+    residuals = _as_residuals(state.observer, seen, at, rows)
     r, noise = residuals.on(axes)
     # Which points are of a known landmark in any case: nearly always all, and each of one.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
     if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at):
         return [Assignment(_taken(m, at, rows), 0.0)]
-    PC, CPC = state.filter.predicted(residuals)
+    PC, CPC = state.known_errors.predicted(residuals)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
     # What it costs that a point is of no landmark.
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
@@ -149,8 +149,8 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     at, rows = _pairs_near(state, index, seen)
     allowed = _may_be(state, seen, at, rows)
     at, rows = at[allowed], rows[allowed]
-    residuals = _as_residuals(state.filter, seen, at, rows)
-    distances = state.filter.distances(residuals)
+    residuals = _as_residuals(state.observer, seen, at, rows)
+    distances = state.gains.distances(residuals)
     held_back = _are_held_back(state, seen, residuals, at, distances)
     at, rows, distances = at[~held_back], rows[~held_back], distances[~held_back]
     # Each pair passes the gate alone; a point keeps its nearest landmarks.
@@ -180,7 +180,7 @@ def _are_held_back(
         return held_back
     residuals = residuals.select(may_be)
     noise = residuals.on(state.axes)[1]
-    predicted = diagonal_blocks(state.filter.predicted(residuals)[1], noise.shape[1])
+    predicted = diagonal_blocks(state.known_errors.predicted(residuals)[1], noise.shape[1])
     held_back[may_be] = np.trace(predicted, axis1=1, axis2=2) > UNCERTAIN**2 * np.trace(
         noise, axis1=1, axis2=2
     )
@@ -189,17 +189,16 @@ def _are_held_back(
 
 def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
-    of_pose, of_landmarks = state.filter.pose_covariance(), state.filter.landmark_covariances()
-    if of_pose is None or of_landmarks is None:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    errors = state.known_errors
+    of_pose, of_landmarks = errors.pose_covariance(), errors.landmark_covariances()
     C = SPATIAL.output_matrix(seen.points)
     of_points = C @ of_pose @ transpose(C) + seen.noise
     spread_m = _spread_m(of_points) + np.max(_spread_m(of_landmarks), initial=0.0)
     if seen.D is not None:
-        deviations = np.sqrt(state.filter.calibration_variances)
+        deviations = np.sqrt(state.gains.calibration_variances)
         spread_m = spread_m + np.linalg.norm(seen.D, axis=1) @ deviations
     reach_m = state.settings.rejection_threshold * spread_m
-    return index.near(state.filter.points, seen.points, reach_m)
+    return index.near(state.observer.points, seen.points, reach_m)
 
 
 def _may_be(state: State, seen: _Points, at: IntArray, rows: IntArray) -> BoolArray:
@@ -210,11 +209,11 @@ def _may_be(state: State, seen: _Points, at: IntArray, rows: IntArray) -> BoolAr
     return np.asarray(np.where(known_rows >= 0, rows == known_rows, others))
 
 
-def _as_residuals(filter_: Filter, seen: _Points, at: IntArray, rows: IntArray) -> Residuals:
+def _as_residuals(observer: Observer, seen: _Points, at: IntArray, rows: IntArray) -> Residuals:
     """Return the residuals if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
-    a = filter_.translations(rows)
+    a = observer.translations(rows)
     e = seen.points[at] - a
-    r, D = e - filter_.observer.y_ref[rows], None if seen.D is None else seen.D[at]
+    r, D = e - observer.y_ref[rows], None if seen.D is None else seen.D[at]
     return Residuals(rows, e, r, a, seen.noise[at], np.zeros(len(rows)), D)
 
 

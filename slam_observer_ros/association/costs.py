@@ -43,7 +43,7 @@ def pairing_cost(state: State, m: int, residuals: Residuals) -> float:
     """Return the cost of believing the ids of m points; what the gate rejects is an outlier."""
     r, noise = residuals.on(state.axes)
     passed, predicted = gated(
-        r, state.filter.predicted(residuals)[1], noise, state.settings.rejection_threshold
+        r, state.known_errors.predicted(residuals)[1], noise, state.settings.rejection_threshold
     )
     paired_cost = joint_cost(r[passed], with_blocks(predicted, noise[passed]), noise[passed])
     return paired_cost + (m - int(np.sum(passed))) * outlier_cost(state)

@@ -20,10 +20,12 @@ from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     as_its_ids_say,
+    consistent,
     Interpretation,
     interpretations,
     is_ambiguous,
     may_relabel,
+    noted,
 )
 from slam_observer_ros.association.joint_compatibility import (
     pruning_cost,
@@ -182,8 +184,8 @@ class Hypotheses:
                 variances = np.diagonal(motion.covariances.sum(axis=0))
             if state is not self.best:
                 continue
-            self._standing.moved.append((before, state.observer.A.copy()))
-            calibration = state.filter.calibration
+            self._standing.moved.append(se3.between(before, state.observer.A))
+            calibration = state.calibration
             if calibration.delay_error_ns:
                 self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
         if len(self._standing.moved) > MAX_MOTIONS:
@@ -193,10 +195,10 @@ class Hypotheses:
     @property
     def calibration(self) -> list[CalibrationEstimate]:
         """Scale, bias and delay of the velocity in the most likely state."""
-        known, initial_s = self.best.filter, self.best.settings.velocity_delay_stddev
+        best, initial_s = self.best, self.best.settings.velocity_delay_stddev
         return [
             self._delay_evidence.corrected(part, initial_s) if part.name == DELAY_NAME else part
-            for part in known.calibration.estimates(known.calibration_variances)
+            for part in best.calibration.estimates(best.gains.calibration_variances)
         ]
 
     def clear_time(self) -> None:
@@ -232,7 +234,7 @@ class Hypotheses:
     def _judge(self, event: ObservationEvent) -> None:
         """Stop where the wheels spin, and give up landmarks that the robot carries."""
         standing, best = self._standing, self.best
-        if not best.filter.has_joint_covariance or self._velocities is None:
+        if best.errors is None or self._velocities is None:
             return
         was_slipping, were_carried = standing.slip is not None, standing.carried
         lost = standing.note(best, event, self._velocities)
@@ -251,12 +253,14 @@ class Hypotheses:
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        if len(self._all) == 1 and (outcome := _observed(self.best, event)) is not None:
-            self._some_have_ids = True
-            return outcome
+        if len(self._all) == 1:
+            outcome = usual.observe(self.best, event) or in_parts.observe(self.best, event)
+            if outcome is not None:
+                self._some_have_ids = True
+                return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        if self.best.filter.joint is None:
+        if self.best.errors is None:
             return self._observe_alone(event)
         if len(self._all) == 1 and not unknown:
             matched = match(self.best, event)
@@ -319,6 +323,7 @@ class Hypotheses:
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
+        hypothesis.verdicts = noted(hypothesis.verdicts, state, taken, event)
         if (event.ids == UNKNOWN_ID).any():
             hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
@@ -339,11 +344,17 @@ class Hypotheses:
         for number, hypothesis in enumerate(self._all):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
-            used = None if is_alone else _observed(state, event, is_weighed=True)
+            used = None
+            if not is_alone:
+                used = usual.observe(state, event, True) or in_parts.observe(state, event, True)
             meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
-            for taken in meanings or interpretations(
+            found = meanings or interpretations(
                 state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
-            ):
+            )
+            if not is_alone:
+                before = hypothesis.verdicts
+                found = consistent(before, state, found, event) or found * (number == 0)
+            for taken in found:
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
@@ -355,12 +366,6 @@ class Hypotheses:
             ids = hypothesis.state.landmarks.ids
             self._next_id = max(self._next_id, int(np.max(ids[is_automatic(ids)], initial=0)) + 1)
         return self._next_id + np.arange(m)
-
-
-def _observed(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
-    """Let a state use an observation, or a part of it, as usual; None where it is not."""
-    outcome = usual.observe(state, event, is_weighed)
-    return in_parts.observe(state, event, is_weighed) if outcome is None else outcome
 
 
 def _are_one(child: _Child, other: _Child) -> bool:
@@ -393,7 +398,7 @@ def are_one(
             rows, other_rows = state.landmarks.rows_of(ids), other.landmarks.rows_of(ids)
             if (rows < 0).any() or (other_rows < 0).any():
                 return False
-            own, others = state.filter.world_points, other.filter.world_points
+            own, others = state.observer.world_points, other.observer.world_points
             shifts.append(own[rows] - others[other_rows])
     distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
     return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)

@@ -162,7 +162,7 @@ class Visibility:
         landmarks = state.landmarks
         is_numbered, everything = is_automatic(landmarks.ids), np.arange(len(landmarks))
         seen = landmarks.last_seen_ns == event.stamp_ns
-        in_view = seen | self._field_of_view.contains(state.filter.expected_points(everything))
+        in_view = seen | self._field_of_view.contains(state.observer.body_points(everything))
         if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
             state.counts['unexpected_place'] += 1
         # Those without an id of their own: what it costs to have missed them, and their counts.
@@ -242,6 +242,8 @@ class Hypothesis:
     visibility: Visibility  # what is in view of a sensor that gives no ids
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
     cost: float = 0.0  # −2 ln of its likelihood, over that of the most likely one
+    # By id, where suspects were when they were seen last, and whether they were believed.
+    verdicts: dict[int, tuple[FloatArray, bool]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, state: State) -> Hypothesis:
@@ -250,7 +252,9 @@ class Hypothesis:
 
     def with_state(self, state: State) -> Hypothesis:
         """Return another hypothesis, which has had the same landmarks in view."""
-        return Hypothesis(state, self.visibility.copy(), copy(self.index), self.cost)
+        return Hypothesis(
+            state, self.visibility.copy(), copy(self.index), self.cost, self.verdicts
+        )
 
     def copy(self) -> Hypothesis:
         """Return an independent copy."""

@@ -32,7 +32,7 @@ from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import are_far, far_from_the_others
-from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation
+from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Outcome
 
@@ -51,6 +51,7 @@ class Interpretation:
     # Points that the gate lets pass and that are left out all the same. Their landmarks were seen
     # so seldom that the landmarks may be the outliers.
     disbelieved: ObservationEvent | None = None
+    suspects: IntArray = field(default_factory=_none)  # ids that may be wrong, left out or not
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
@@ -86,7 +87,7 @@ def interpretations(
     # Points that may be of several landmarks.
     if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
         found = find_assignments(state, index, event, new_cost, budget, is_alone)
-        return _by_assignments(state, event, new_ids, suspects, found)
+        return _of_suspects(_by_assignments(state, event, new_ids, suspects, found), suspects)
     # All ids are right, or those of one or all suspects are wrong, or the robot slipped.
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
@@ -94,7 +95,11 @@ def interpretations(
         trusting, slipped = Interpretation(event, pairing_cost(state, m, residuals)), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
     without = [_without(ids, state, matched, trusting) for ids in doubted]
-    return [trusting, *without, *slipped]
+    return _of_suspects([trusting, *without, *slipped], suspects)
+
+
+def _of_suspects(found: list[Interpretation], suspects: IntArray) -> list[Interpretation]:
+    return [replace(one, suspects=suspects) for one in found] if len(suspects) else found
 
 
 def as_its_ids_say(state: State, event: ObservationEvent, outcome: Outcome) -> Interpretation:
@@ -128,6 +133,45 @@ def _without(
         cost - saved,
         disbelieved=event.select(np.isin(event.ids, unconfirmed_ids)),
     )
+
+
+Verdicts = dict[int, tuple[FloatArray, bool]]
+"""By id, where suspects were (3,) when they were seen last, and whether they were believed."""
+
+
+def noted(
+    verdicts: Verdicts, state: State, taken: Interpretation, event: ObservationEvent
+) -> Verdicts:
+    """Return the verdicts after an observation that was taken as interpreted."""
+    if not len(taken.suspects):
+        return verdicts
+    points, believed = positions(state, event)[0], np.isin(event.ids, taken.event.ids)
+    suspects = np.flatnonzero(np.isin(event.ids, taken.suspects)).tolist()
+    return verdicts | {int(event.ids[i]): (points[i], bool(believed[i])) for i in suspects}
+
+
+def consistent(
+    verdicts: Verdicts, state: State, possible: list[Interpretation], event: ObservationEvent
+) -> list[Interpretation]:
+    """Return the interpretations that judge points as before, where they were before.
+
+    A point that was left out and one at the same place that is believed are halves of two
+    stories, each of which another hypothesis has followed from the start.
+    """
+    if not verdicts:
+        return possible
+    event = event.select(np.isin(event.ids, list(verdicts)))
+    before = [verdicts[landmark_id] for landmark_id in event.ids.tolist()]
+    points, tolerances_m = positions(state, event)
+    shifts = points - np.reshape([place for place, _ in before], (-1, 3))
+    is_there = np.linalg.norm(shifts, axis=1) <= tolerances_m
+    ids = event.ids[is_there]
+    believed = np.array([was for _, was in before], dtype=np.bool_)[is_there]
+    return [
+        one
+        for one in possible
+        if one.slipped is not None or np.array_equal(np.isin(ids, one.event.ids), believed)
+    ]
 
 
 def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
@@ -196,7 +240,7 @@ def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
 
 def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
     """Return which points (m,) the gate rejects."""
-    return np.asarray(state.filter.distances(residuals) > state.settings.rejection_threshold)
+    return np.asarray(state.gains.distances(residuals) > state.settings.rejection_threshold)
 
 
 def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:
@@ -205,7 +249,7 @@ def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) 
     far = are_far(sensor_distances, gate)
     if far.any():
         r, noise = residuals.on(state.axes)
-        far &= far_from_the_others(r, state.filter.predicted(residuals)[1], noise, gate)
+        far &= far_from_the_others(r, state.known_errors.predicted(residuals)[1], noise, gate)
     return far
 
 

@@ -58,7 +58,7 @@ def slip(state: State, matched: MatchedObservation) -> float:
         covariances=noise,
         duration_s=0.0,
         at_ends=None,
-        calibration=state.filter.calibration,
+        calibration=state.calibration,
         is_slip=True,
     )
     state.propagate(motion)
@@ -135,7 +135,7 @@ class RejectedLandmarks:
         known, settings = matched.known, state.settings
         if not len(known.ids):
             return False
-        if (state.filter.distances(matched.residuals) <= settings.rejection_threshold).any():
+        if (state.gains.distances(matched.residuals) <= settings.rejection_threshold).any():
             self.clear()
             return False
         may_stray = settings.unknown_linear_motion or settings.unknown_angular_motion
@@ -151,7 +151,7 @@ class RejectedLandmarks:
         """Return whether a pose that explains what is seen explains the ``others``, too."""
         trial = state.copy()
         slip(trial, matched)
-        trial.filter.correct(match(trial, matched.event).residuals)
+        trial.gains.observe(match(trial, matched.event).residuals)
         ids = np.array(others)
         rows = trial.landmarks.rows_of(ids)
         rejected = zip(*(self._rejected[i] for i in others), strict=True)
@@ -169,9 +169,9 @@ class RejectedLandmarks:
         )
         if (rows < 0).any():  # one was forgotten meanwhile
             return False
-        trial.filter.expected_points(rows)
+        trial.gains.prepare(rows)
         residuals = residuals_of(trial, seen, rows, covariances)
-        return bool((trial.filter.distances(residuals) <= AGREEMENT).all())
+        return bool((trial.gains.distances(residuals) <= AGREEMENT).all())
 
     def _note(self, state: State, matched: MatchedObservation) -> None:
         """Note where landmarks seem to be that are rejected."""

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Set
 from dataclasses import dataclass, field, replace
+from functools import reduce
 import math
-from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -72,10 +72,6 @@ MAX_MOTIONS = 500
 """Motions between observations that are remembered."""
 
 
-Move: TypeAlias = tuple[FloatArray, FloatArray]
-"""Â (4, 4) before a motion by odometry, and after it; the corrections are in between."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Look:
     """An observation, and how many of the moves that are remembered were before it."""
@@ -98,7 +94,7 @@ class _Pairs:
     since_ns: int
 
     @classmethod
-    def of(cls, start: _Look, now: _Look, moved: list[Move], but: Set[int]) -> _Pairs:
+    def of(cls, start: _Look, now: _Look, moved: list[FloatArray], but: Set[int]) -> _Pairs:
         """Return those of two looks, ``but`` some.
 
         In between the robot has ``moved`` by odometry.
@@ -210,7 +206,8 @@ class Standing:
     carried: set[int] = field(default_factory=set)
     excluded: set[int] = field(default_factory=set)  # landmarks that are carried, or may be
     slip: int | None = None  # which of the SLIPS goes on
-    moved: list[Move] = field(default_factory=list)  # by odometry, since a start …
+    # (4, 4) each by odometry, without corrections, since a start …
+    moved: list[FloatArray] = field(default_factory=list)
     sensor_frame: str = ''  # an observation is due from another one, …
     due_ns: int = 0  # … or from here on
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
@@ -224,7 +221,7 @@ class Standing:
     _enough_m2: float = 0.0  # … or with which it is judged again
     # During a slip, when each landmark was seen last, and whether as that has it.
     _agreed: dict[int, tuple[int, bool]] = field(default_factory=dict)
-    _earlier: list[Move] = field(default_factory=list)  # … and that before
+    _earlier: list[FloatArray] = field(default_factory=list)  # … and that before
 
     def clear_time(self) -> None:
         """Compare nothing with what was seen before."""
@@ -373,7 +370,7 @@ class Standing:
             self._starts.append(look)
         return self._lost(made, made)
 
-    def _slip_on(self, made: list[Move]) -> None:
+    def _slip_on(self, made: list[FloatArray]) -> None:
         """Move what is compared with by what a slip makes of motions; forget these."""
         back = se3.exp(-SLIPS[self.slip or 0] * se3.log(_product(made)))
         self._starts = [
@@ -382,7 +379,7 @@ class Standing:
         ]
         self.moved = []
 
-    def _lost(self, made: list[Move], whole: list[Move]) -> Lost:
+    def _lost(self, made: list[FloatArray], whole: list[FloatArray]) -> Lost:
         """Return what was lost of motions, and may be of others."""
         share, motion = SLIPS[self.slip or 0], _product(made)
         back = se3.inverse(motion).dot(se3.exp(share * se3.log(motion)))
@@ -418,21 +415,14 @@ def _noise(state: State, seen: list[_Pairs]) -> FloatArray:
     return both
 
 
-def _product(moved: list[Move]) -> FloatArray:
+def _product(moved: list[FloatArray]) -> FloatArray:
     """Return moves, one after the other, as one motion (4, 4), in the frame at their start."""
-    if not moved:
-        return np.eye(4)
-    befores, afters = np.array(moved).swapaxes(0, 1)
-    whole, *others = np.linalg.solve(befores, afters)
-    for step in others:
-        whole = whole.dot(step)
-    product: FloatArray = whole
-    return product
+    return reduce(np.dot, moved, np.eye(4))
 
 
 def _motion_noise(state: State, pairs: _Pairs, velocities: VelocityHistory) -> FloatArray:
     """Return the covariance (p, p) of the motion between them, with that of its bias."""
-    calibration, end_ns = state.filter.calibration, pairs.event.stamp_ns
+    calibration, end_ns = state.calibration, pairs.event.stamp_ns
     # What led there so long ago that it is forgotten was off by as much.
     since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)
     start = state.observer.A.dot(se3.inverse(pairs.motion))
@@ -441,7 +431,7 @@ def _motion_noise(state: State, pairs: _Pairs, velocities: VelocityHistory) -> F
     F = longer * motion.sensitivity
     # As it is stated: what slips and carried landmarks have added to it is no reason to wait.
     noise = longer / max(1.0, state.motion_noise.factors.applied.max()) * motion.noise
-    total: FloatArray = noise + (F * state.filter.calibration_variances) @ F.T
+    total: FloatArray = noise + (F * state.gains.calibration_variances) @ F.T
     return total
 
 
@@ -455,7 +445,7 @@ def take_back(state: State, lost: Lost) -> None:
         covariances=block_diag(np.outer(turn, turn), np.outer(way, way))[None],
         duration_s=0.0,
         at_ends=None,
-        calibration=state.filter.calibration,
+        calibration=state.calibration,
         is_slip=True,
     )
     state.propagate(motion)

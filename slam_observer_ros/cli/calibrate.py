@@ -46,12 +46,11 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
 from slam_observer_ros.cli.replay_run import select_inputs
-from slam_observer_ros.common.errors import IncompleteError, UsageError
+from slam_observer_ros.common.errors import IncompleteError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
-from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.runs.health import of_mounting, of_noise
@@ -90,8 +89,7 @@ def run(args: argparse.Namespace) -> None:
     """Calibrate by a recording, and judge on what was held out."""
     given = read_given(args)
     request = read_request(args, given, args.recording)
-    if not DESIGNS[request.settings.gains].has_joint_covariance:
-        raise UsageError(f'calibrate needs riccati gains, not {request.settings.gains}')
+    request.need_errors('calibrate')
     read = {f'the recording {path}': files_of(path) for path in (args.recording, *args.hold_out)}
     survey = None
     if args.survey is not None:

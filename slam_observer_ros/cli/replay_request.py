@@ -9,9 +9,11 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slam_observer_ros.cli.options import Given, named, named_path, settings_of
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -79,9 +81,14 @@ class ReplayRequest:
 
     def checked(self) -> ReplayRequest:
         """Return itself; a UsageError is raised if it is to smooth with gains that can't."""
-        if self.smooth and not DESIGNS[self.settings.gains].has_joint_covariance:
-            raise UsageError(f'--smooth needs riccati gains, not {self.settings.gains}')
+        if self.smooth:
+            self.need_errors('--smooth')
         return self
+
+    def need_errors(self, what: str) -> None:
+        """Raise a UsageError unless its gains know their errors, which ``what`` needs."""
+        if make_gains(self.settings, np.eye(4)).errors is None:
+            raise UsageError(f'{what} needs riccati gains, not {self.settings.gains}')
 
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:

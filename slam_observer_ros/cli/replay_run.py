@@ -18,7 +18,6 @@ from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -190,7 +189,7 @@ def _never_found(result: Replay, maps: Sequence[LandmarkMap]) -> str:
 def _advice(result: Replay) -> str:
     """Return what to do if the landmarks seen did not determine the pose."""
     counts, settings = result.estimator.counts, result.estimator.settings
-    if counts['unknown_id'] and not DESIGNS[settings.gains].has_joint_covariance:
+    if counts['unknown_id']:
         return f'; {counts["unknown_id"]} points without id take --gains riccati'
     if 2 * counts['repeated_id'] > counts['observed_point']:
         return f'; {counts["repeated_id"]} points were {UNUSED_POINTS["repeated_id"]}'

@@ -37,7 +37,6 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
 from slam_observer_ros.common.errors import IncompleteError, UsageError
-from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import write_found
@@ -60,8 +59,7 @@ def run(args: argparse.Namespace) -> None:
     given = read_given(args)
     request = read_request(args, given, args.recordings[0])
     settings = request.settings
-    if not DESIGNS[settings.gains].has_joint_covariance:
-        raise UsageError(f'tune needs riccati gains, not {settings.gains}')
+    request.need_errors('tune')
     recordings = [*args.recordings, *args.hold_out]
     read = {f'the recording {path}': files_of(path) for path in recordings}
     check_inputs_are_kept({'--out': args.out}, read)

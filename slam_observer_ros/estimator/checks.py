@@ -31,7 +31,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import are_covariances, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
 from slam_observer_ros.known_map.map_correlations import check_joint
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
 from slam_observer_ros.state.landmark_table import LandmarkTable
 
@@ -328,7 +328,7 @@ def _check_definite(name: str, covariances: FloatArray) -> None:
 def usable_points(
     event: ObservationEvent,
     settings: Settings,
-    filter_: Filter,
+    gains: Gains,
     landmarks: LandmarkTable,
     counts: Counter[str],
     warnings: EventWarnings,
@@ -337,16 +337,22 @@ def usable_points(
     counts['observed_point'] += len(event.ids)
     event = flatten(event) if settings.two_d_mode else event
     if event.orientations is not None:
-        used = so3.exact(event.orientations) if filter_.estimates_orientations else None
+        used = None if gains.tags is None else so3.exact(event.orientations)
         event = replace(event, orientations=used)
+    if gains.observer.is_exact and event.velocities is not None:
+        event = replace(event, velocities=None)  # its landmarks are at rest
+    ids = event.ids.tolist()
+    are_usual = 0 < len(set(ids)) == len(ids) <= MAX_WEIGHED
+    if are_usual and min(ids) >= 0 and max(ids) < FIRST_AUTOMATIC_ID:
+        return event
     if (impossible := event.ids == IMPOSSIBLE_ID).any():
         warnings.warn('impossible_id', count=int(np.sum(impossible)))
         counts['impossible_id'] += int(np.sum(impossible))
         event = event.select(~impossible)
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
-        ids = listed(event.ids[reserved].tolist())
-        warnings.warn('reserved_id', ids=ids, first=FIRST_AUTOMATIC_ID, last=LAST_AUTOMATIC_ID)
+        named = listed(event.ids[reserved].tolist())
+        warnings.warn('reserved_id', ids=named, first=FIRST_AUTOMATIC_ID, last=LAST_AUTOMATIC_ID)
         counts['reserved_id'] += int(np.sum(reserved))
         event = event.select(~reserved)
     if repeated_ids := event.repeated_ids():  # nobody knows which of the points is right
@@ -355,7 +361,7 @@ def usable_points(
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
     unknown = event.ids == UNKNOWN_ID
-    can_weigh = filter_.joint is not None
+    can_weigh = gains.errors is not None
     if not can_weigh and np.count_nonzero(unknown):
         warnings.warn('unknown_id', gains=settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))

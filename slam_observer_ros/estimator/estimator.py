@@ -39,7 +39,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.known_map.merging import map_of
-from slam_observer_ros.observer.designs import make_filter
+from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
@@ -346,9 +346,10 @@ class Estimator:
 
         Unless its frame is that of a loaded map, its covariances are those of its shape alone.
         """
-        landmark_map = map_of(self._state, self._localiser.loaded if self.is_localised else None)
-        has_covariances = landmark_map.covariances is not None
-        if has_covariances and landmark_map.joint_covariance is None and not self._state.is_fixed:
+        state, loaded = self._state, self._localiser.loaded if self.is_localised else None
+        landmark_map = map_of(state, loaded)
+        is_joint = landmark_map.joint_covariance is not None or state.observer.is_exact
+        if landmark_map.covariances is not None and not is_joint:
             self._warnings.warn('left_out_correlations', count=len(landmark_map.ids))
         return landmark_map
 
@@ -417,7 +418,7 @@ class Estimator:
     def body_velocity(self) -> FloatArray:
         """(6,) newest velocity (Ω, v), calibrated, rad/s and m/s; zero when it has timed out."""
         velocity = self._timeline.body_velocity  # of a little earlier or later if delayed
-        return np.zeros(6) if velocity is None else self._state.filter.calibration.apply(velocity)
+        return np.zeros(6) if velocity is None else self._state.calibration.apply(velocity)
 
     @property
     def body_velocity_covariance(self) -> FloatArray | None:
@@ -428,12 +429,12 @@ class Estimator:
         held = self._timeline.velocity_in_force
         if held is None:
             return None
-        known, axes = self._state.filter, self._state.filter.axes
-        measured = self._state.motion_noise.velocity_covariance(held)
+        state, axes = self._state, self._state.axes
+        measured = state.motion_noise.velocity_covariance(held)
         if axes.p < len(measured):
             measured = axes.full_pose_covariance(measured[axes.pose, axes.pose])
-        return known.calibration.apply_to_covariance(
-            measured, held.body_velocities[0], known.calibration_variances
+        return state.calibration.apply_to_covariance(
+            measured, held.body_velocities[0], state.gains.calibration_variances
         )
 
     @property
@@ -455,7 +456,7 @@ class Estimator:
     def world_points(self) -> FloatArray:
         """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
         state, lead_s = self._state, self._timeline.lead_s
-        points = state.filter.world_points[state.confirmed]
+        points = state.observer.world_points[state.confirmed]
         return points + lead_s * self.landmark_velocities if lead_s else points
 
     @property
@@ -471,10 +472,7 @@ class Estimator:
         observation: ask for it in ``on_update``. ``rows`` (m,) are indices into ``landmark_ids``.
         None where the filter knows none, or landmarks are fixed, whose errors nobody knows.
         """
-        state = self._state
-        if state.is_fixed:
-            return None
-        return state.filter.configuration_covariance(state.confirmed[rows])
+        return self._state.configuration_covariance(self._state.confirmed[rows])
 
     @property
     def landmark_velocities(self) -> FloatArray:
@@ -551,7 +549,7 @@ class Estimator:
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings
         usable = usable_points(
-            event, self.settings, state.filter, state.landmarks, self._counts, warnings
+            event, self.settings, state.gains, state.landmarks, self._counts, warnings
         )
         event = self._timeline.synchronise(usable)
         if self._localiser.loaded is not None:
@@ -653,7 +651,7 @@ class Estimator:
 
     def _state_at(self, pose: FloatArray) -> State:
         """Return a state at its start, with P° = ``pose`` (4, 4)."""
-        state = State(make_filter(self._live, pose), self._live)
+        state = State(make_gains(self._live, pose), self._live)
         state.judges_innovations = self._judges_innovations
         return state
 
@@ -665,11 +663,10 @@ class Estimator:
         """Name settings that have been changed and have no effect."""
         settings = self.settings
         changed = set(changed_names(settings))
-        if unused := [name for name in self._state.filter.ignores if name in changed]:
+        if unused := [name for name in self._state.gains.ignores if name in changed]:
             logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
-        filter_ = self._state.filter
-        takes_points = filter_.has_joint_covariance and not filter_.estimates_orientations
-        if settings.use_tag_orientation and takes_points:
+        is_ignored = 'use_tag_orientation' in self._state.gains.ignores
+        if settings.use_tag_orientation and self._state.gains.tags is None and not is_ignored:
             logger.warning(
                 'use_tag_orientation has no effect with landmark_velocity_stddev: landmarks are '
                 'points that move (set landmark_velocity_stddev: 0.0 for tags at rest).'
@@ -691,10 +688,9 @@ class Estimator:
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
-        joint = state.filter.joint
-        is_dense = joint is not None and joint.is_dense and not state.is_fixed
+        is_dense = state.joint is not None and state.joint.is_dense
         warnings.large_map(len(state.landmarks), limit, is_dense)
-        distance_m = np.abs(state.observer.A[:3, 3]).max()
+        distance_m = math.hypot(*state.observer.A[:3, 3].tolist())
         if not distance_m <= DIVERGED_M:  # nor is what is no number
             self._start_again(distance_m)
 

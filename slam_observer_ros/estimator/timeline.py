@@ -177,7 +177,7 @@ class Timeline:
         """Return how a pose (4, 4) of a stamp, with its covariance (6, 6), is at ``stamp_ns``."""
         end_ns, best = max(self.stamp_ns or 0, stamp_ns), self._hypotheses.best
         motion = self.motion(stamp_ns, end_ns)
-        calibration = best.filter.calibration
+        calibration = best.calibration
         noise = transition_covariance(
             self.velocities, calibration, best.motion_noise, stamp_ns, end_ns
         )
@@ -187,7 +187,7 @@ class Timeline:
         """Return how the body moves (4, 4) between two stamps, backwards if need be."""
         if end_ns < start_ns:
             return se3.inverse(self.motion(end_ns, start_ns))
-        calibration = self._hypotheses.best.filter.calibration
+        calibration = self._hypotheses.best.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
 
 

@@ -91,11 +91,11 @@ class Finder:
         """
         if not (rows := self._rows(state)).size or not self._is_due(state, rows):
             return None
-        P = state.filter.joint_covariance(rows)
+        P = state.gains.joint_covariance(rows)
         if P is None:
             return None
         p = state.axes.p
-        seen = Constellation(state.filter.points[rows], P[p:, p:], np.full(len(rows), -1))
+        seen = Constellation(state.observer.points[rows], P[p:, p:], np.full(len(rows), -1))
         ids = state.landmarks.ids[rows]
         error_probability = state.settings.localization_error_probability
         self.places = places = self._search(seen, ids, error_probability)

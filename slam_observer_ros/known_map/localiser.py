@@ -190,7 +190,7 @@ class Localiser:
 
     def _find(self, state: State) -> None:
         """Find the pose by landmarks without ids."""
-        if not len(self.maps[0].ids) or state.filter.joint is None:
+        if not len(self.maps[0].ids) or state.errors is None:
             return
         if self._finder is None:
             from slam_observer_ros.known_map.finder import Finder  # which few runs need

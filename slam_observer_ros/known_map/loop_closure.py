@@ -64,7 +64,7 @@ class LoopClosure:
         rows = np.flatnonzero(landmarks.last_seen_ns == stamp_ns)
         if len(rows) < 2:
             return
-        points, ids = state.filter.points[rows], landmarks.ids[rows].tolist()
+        points, ids = state.observer.points[rows], landmarks.ids[rows].tolist()
         lengths_m = np.linalg.norm(points[:, None] - points, axis=2)
         for i, j in zip(*np.nonzero(np.triu(lengths_m < self._near_m, 1)), strict=True):
             self._apart.add((min(ids[i], ids[j]), max(ids[i], ids[j])))
@@ -117,7 +117,7 @@ class LoopClosure:
         added = known[is_automatic(landmarks.ids[known]) & (missed == 0)]
         if not len(absent) or not len(added):
             return
-        points = state.filter.points[:, : state.axes.point]
+        points = state.observer.points[:, : state.axes.point]
         off_m = np.linalg.norm(points[absent][:, None] - points[added], axis=2)
         is_since = landmarks.born_ns[added] > landmarks.last_seen_ns[absent][:, None]
         # Nearer to a known one than half as far as this is from the robot, or from a third one.
@@ -141,7 +141,7 @@ class LoopClosure:
         from scipy.spatial import cKDTree  # which only points without ids need
 
         landmarks, k = state.landmarks, state.axes.point
-        points = state.filter.points[own, :k]
+        points = state.observer.points[own, :k]
         tree = cKDTree(points)
         # How many there are about each, but for a twin.
         some = min(NEIGHBOURS + 2, len(own))
@@ -179,7 +179,7 @@ def _own(state: State) -> IntArray:
 
 def _within_reach(state: State, new: IntArray, old: IntArray) -> IntArray:
     """Return the old landmarks (n,) that new ones (m,) may be."""
-    points = state.filter.points
+    points = state.observer.points
     centre = points[new].mean(axis=0)
     radius_m = np.linalg.norm(points[new] - centre, axis=1).max()
     off_m = np.linalg.norm(points[old] - centre, axis=1)
@@ -197,10 +197,10 @@ def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArr
     from slam_observer_ros.known_map.distances import MappedLandmarks
     from slam_observer_ros.known_map.places import Anywhere, Constellation, Near
 
-    P = state.filter.joint_covariance(np.append(new, old))
+    P = state.gains.joint_covariance(np.append(new, old))
     if P is None:
         return None
-    axes, points, p = state.axes, state.filter.points, state.axes.p
+    axes, points, p = state.axes, state.observer.points, state.axes.p
     m, k = len(new), axes.point
     blocks = P[p:, p:].reshape(m + len(old), k, -1, k).swapaxes(1, 2)
     known = MappedLandmarks(points[old], _local_covariances(points[old], blocks[m:, m:]), axes)
@@ -211,7 +211,7 @@ def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArr
     shape = root @ root.T + LEAST_M**2 * np.eye(m * k)
     seen = Constellation(points[new], shape, np.full(m, -1))
     error_probability = state.settings.localization_error_probability
-    of_pose = state.filter.pose_covariance()
+    of_pose = state.known_errors.pose_covariance()
     prior = Anywhere(known) if of_pose is None else Near(np.eye(4), of_pose, axes)
     places = find_places(known, seen, prior, error_probability)
     place = places.decided(error_probability)
@@ -242,10 +242,10 @@ def _differences(state: State, rows: IntArray, others: IntArray) -> tuple[FloatA
     """Return how far landmarks (q,) are from others (q,): (q, k), and its covariances."""
     k, p, q = state.axes.point, state.axes.p, len(rows)
     both, at = np.unique(np.append(rows, others), return_inverse=True)
-    P = state.filter.joint_covariance(both)
+    P = state.gains.joint_covariance(both)
     if P is None:
         raise TypeError('a filter without a joint covariance has no twins')
     blocks = P[p:, p:].reshape(len(both), k, len(both), k).swapaxes(1, 2)
     a, b = at[:q], at[q:]
     S = blocks[a, a] + blocks[b, b] - blocks[a, b] - blocks[b, a] + LEAST_M**2 * np.eye(k)
-    return (state.filter.points[rows] - state.filter.points[others])[:, :k], S
+    return (state.observer.points[rows] - state.observer.points[others])[:, :k], S

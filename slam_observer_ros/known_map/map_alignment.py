@@ -138,7 +138,7 @@ class TagPose:
 
 def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> TagPose | None:
     """Return the pose in a map by the tag that says it best, but for ``refused`` ids; or None."""
-    tags, R, sigmas = state.filter.orientations, known.orientations, known.orientation_sigmas
+    tags, R, sigmas = state.observer.orientations, known.orientations, known.orientation_sigmas
     if R is None or sigmas is None:
         return None
     # Tags that both have, and that were seen the same way each time.
@@ -151,20 +151,20 @@ def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> 
     shared, own = shared[is_sure], own[is_sure]
     if not len(own):
         return None
-    turn_stds = np.hypot(state.filter.orientation_sigmas(own), sigmas[shared])
+    turn_stds = np.hypot(state.known_errors.orientation_sigmas(own), sigmas[shared])
     best = int(np.argmin(turn_stds))
     if turn_stds[best] > MAX_TURN_STD_RAD:
         return None
     at, row, A = shared[best], own[best : best + 1], state.observer.A
     # From the frame of P° to the map: by how the tag is turned, and where it is.
-    turn = R[at] @ state.filter.orientation_matrices(row)[0].T
-    lever = turn @ (A[:3, 3] - state.filter.points[row[0]])
+    turn = R[at] @ state.known_errors.orientation_matrices(row)[0].T
+    lever = turn @ (A[:3, 3] - state.observer.points[row[0]])
     pose = se3.pose(turn @ A[:3, :3], known.world_points[at] + lever)
     # An error of the tag's turn moves the robot about it.
     J = np.vstack([np.eye(3), -so3.hat(lever)])
     covariance = turn_stds[best] ** 2 * J @ J.T
     covariance[3:, 3:] += known.covariances_or(state.settings.map_noise)[at]
-    seen, k = state.filter.configuration_covariance(row), state.axes.point
+    seen, k = state.configuration_covariance(row), state.axes.point
     if seen is not None:
         relative = np.zeros((3, 3))
         relative[:k, :k] = seen

@@ -45,7 +45,7 @@ def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray |
     """
     state.set_pose(state.observer.pose, pose_covariance)
     if state.settings.localization_mode != 'fixed':
-        state.filter.add_known(_in_reference_frame(state, known))
+        state.gains.add_known(_in_reference_frame(state, known))
     _complete(state, known, known)
 
 
@@ -93,8 +93,8 @@ def joint_covariance(
     shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None where
     the gains know no joint covariance.
     """
-    m, axes, points = len(rows), state.axes, state.filter.points[rows]
-    joint = state.filter.joint
+    m, axes, points = len(rows), state.axes, state.observer.points[rows]
+    joint = state.joint
     P = None if joint is None else joint.of_landmarks(rows, points, tags)
     if P is None or m == 0:
         return P
@@ -133,11 +133,11 @@ def _find_frame(
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
     axes = state.axes
-    covariance = state.filter.joint_covariance(rows)
+    covariance = state.gains.joint_covariance(rows)
     if covariance is None:
         covariance = _of_constant_gains(state, rows)
     target = known.landmarks_in(np.eye(4), state.settings.map_noise)
-    return find_transform(state.filter.points[rows], covariance, target, axes)
+    return find_transform(state.observer.points[rows], covariance, target, axes)
 
 
 def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
@@ -156,7 +156,7 @@ def _merge(state: State, known: LandmarkMap) -> None:
     merged, others = np.flatnonzero(rows >= 0), np.flatnonzero(rows < 0)
     rows, is_exact = rows[merged], state.settings.localization_mode == 'fixed'
     taken = merged if is_exact else np.append(merged, others)
-    state.filter.enter_map(rows, _in_reference_frame(state, known.select(taken)))
+    state.gains.enter_map(rows, _in_reference_frame(state, known.select(taken)))
     state.landmarks.counts[rows] += _counts(known.select(merged), state)
     _complete(state, known, known.select(others))
 
@@ -201,8 +201,7 @@ def _fix(state: State, known: LandmarkMap) -> None:
     order = np.argsort(known.ids)
     rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
     exact = _in_reference_frame(state, known.select(rows))
-    state.fix_landmarks(exact.points, exact.covariances)
-    state.filter.take_orientations(np.arange(len(exact)), exact)
+    state.fix_landmarks(exact)
 
 
 def _in_reference_frame(state: State, known: LandmarkMap) -> KnownLandmarks:
@@ -223,11 +222,11 @@ def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
     """
     rows = state.confirmed
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
-    if state.is_fixed and loaded is not None:
+    if state.observer.is_exact and loaded is not None:
         return _exact_map(state, rows, loaded)
     landmark_map = LandmarkMap(
         state.landmarks.ids[rows],
-        state.filter.world_points[rows],
+        state.observer.world_points[rows],
         None,
         state.landmarks.counts[rows],
         orientations=_orientations_of(state, rows),
@@ -253,7 +252,7 @@ def _with_covariances(
         of_turns = diagonal_blocks(joint[3 * n :, 3 * n :], 3)
         sigmas[tags] = np.sqrt(np.maximum(np.linalg.eigvalsh(of_turns)[:, -1], 0.0))
     elif len(tags):
-        sigmas[tags] = state.filter.orientation_sigmas(rows[tags])
+        sigmas[tags] = state.known_errors.orientation_sigmas(rows[tags])
     return replace(
         landmark_map,
         covariances=covariances,
@@ -271,9 +270,9 @@ def _exact_map(state: State, rows: IntArray, loaded: LandmarkMap) -> LandmarkMap
 
 def _orientations_of(state: State, rows: IntArray) -> FloatArray | None:
     """Return orientations (m, 3, 3) in the world."""
-    tags = state.filter.orientations
+    tags = state.observer.orientations
     if not tags.are_known[rows].any():
         return None
-    B = state.filter.orientation_matrices(rows)
+    B = state.known_errors.orientation_matrices(rows)
     world: FloatArray = state.observer.reference_pose[:3, :3] @ B
     return world

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, TYPE_CHECKING
+from typing import ClassVar, Protocol, TYPE_CHECKING
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, LandmarkColumns
+from slam_observer_ros.common.types import FloatArray, IntArray, LandmarkColumns
 from slam_observer_ros.observer.orientations import LandmarkOrientations
-from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+class Postponed(Protocol):
+    """Moves of landmarks that have yet to be made, as looking at a map must not change it."""
+
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far the observer has yet to move landmarks (m, 3), metres."""
 
 
 class FilterArrays(LandmarkColumns):
@@ -21,7 +28,8 @@ class FilterArrays(LandmarkColumns):
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
     each (n, 3), metres and m/s, the ``orientations`` of tags, and ``covariance``, P (N, N), empty
     for gains that know none.
-    ``have_moved`` says whether any landmark has had a velocity so far.
+    ``have_moved`` says whether any landmark has had a velocity so far, ``is_exact`` that the map
+    is, and no landmark is moved. ``postponed`` says what â_i have yet to follow, in large maps.
     """
 
     COLUMNS: ClassVar = dict.fromkeys(('y_ref', 'a', 'u'), (np.float64, (3,)))
@@ -35,7 +43,8 @@ class FilterArrays(LandmarkColumns):
         self.A: FloatArray = np.eye(4)
         self.covariance = SymmetricMatrix(np.zeros((0, 0)))
         self.orientations = LandmarkOrientations()
-        self.have_moved = False
+        self.have_moved = self.is_exact = False
+        self.postponed: Postponed | None = None
 
     @property
     def P(self) -> FloatArray:  # noqa: N802 (the field's name for it)

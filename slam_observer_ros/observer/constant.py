@@ -20,17 +20,15 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
-from slam_observer_ros.observer.filter import Filter, OF_JOINT_COVARIANCES
+from slam_observer_ros.observer.gains import Gains, OF_JOINT_COVARIANCES
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
-from slam_observer_ros.settings.estimator_settings import Settings
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
 
 
-class ConstantFilter(Filter):
+class ConstantGains(Gains):
     """Constant gains k (30) and l (31), the same for every landmark.
 
     The ``step_mode`` 'paper' turns about the reference's origin with the metric of (10), and so
@@ -53,15 +51,11 @@ class ConstantFilter(Filter):
         'orientation_noise',
     )
 
-    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
-        super().__init__(settings, reference_pose)
-        self.calibration = Calibration(without_calibration(settings), self.axes)
-
-    def correct(self, residuals: Residuals) -> FloatArray:
+    def observe(self, residuals: Residuals) -> FloatArray:
         """Integrate the innovation (30), (31) over the time since landmarks were seen before."""
         # The gains, and how long they act.
         settings, e, r = self._settings, residuals.e, residuals.r
-        gain_l = 0.0 if self.is_exact else settings.gain_l
+        gain_l = 0.0 if self.observer.is_exact else settings.gain_l
         k = np.full(len(r), settings.gain_k)
         step = paper_step if settings.step_mode == 'paper' else centroid_step
         dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)

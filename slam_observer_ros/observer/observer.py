@@ -17,7 +17,7 @@ from slam_observer_ros.observer.arrays import FilterArrays
 class Observer(FilterArrays):
     """State X̂ on SLAM_n(3) with its reference ξ°: what the paper does to these arrays.
 
-    What methods return are copies.
+    What methods return are copies, with moves that are ``postponed``.
     """
 
     @property
@@ -29,16 +29,23 @@ class Observer(FilterArrays):
     @property
     def points(self) -> FloatArray:
         """(n, 3) estimated landmarks y_i° + â_i, metres, reference frame."""
-        return self.y_ref + self.a
+        return self.y_ref + self.translations(np.arange(len(self)))
+
+    @property
+    def world_points(self) -> FloatArray:
+        """(n, 3) the same in the world."""
+        return se3.transform(self.reference_pose, self.points)
+
+    def translations(self, rows: IntArray) -> FloatArray:
+        """Return â_i (m, 3) of landmarks, metres."""
+        a: FloatArray = self.a.take(rows, axis=0, mode='wrap')
+        return a if self.postponed is None else a + self.postponed.postponed_shifts(rows)
 
     def body_points(self, rows: IntArray) -> FloatArray:
-        """Return where landmarks should be seen, Â⁻¹ (y_i° + â_i) (m, 3), metres, body frame."""
-        return self.in_body_frame(self.points.take(rows, axis=0, mode='wrap'))
-
-    def in_body_frame(self, points: FloatArray) -> FloatArray:
-        """Return points (m, 3) of the reference frame in the body frame, metres."""
-        turned: FloatArray = (points - self.A[:3, 3]).dot(self.A[:3, :3])
-        return turned
+        """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
+        points = self.y_ref.take(rows, axis=0, mode='wrap') + self.translations(rows)
+        seen: FloatArray = (points - self.A[:3, 3]).dot(self.A[:3, :3])  # Â⁻¹ (y_i° + â_i)
+        return seen
 
     def turned(self, covariances: FloatArray) -> FloatArray:
         """Return covariances (m, 3, 3) from the body frame in the reference frame."""
@@ -96,10 +103,10 @@ class Observer(FilterArrays):
         self.orientations.clear(rows)
 
     def fix_landmarks(self, y_ref: FloatArray) -> None:
-        """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest."""
+        """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest, for good."""
         self.remove_landmarks(np.arange(len(self)))
         self.add_reference_landmarks(y_ref)
-        self.have_moved = False
+        self.have_moved, self.is_exact = False, True
 
     def set_reference(self, y_ref: FloatArray) -> None:
         """Put the landmarks at ``y_ref`` (n, 3), reference frame, with â_i = 0."""

@@ -32,15 +32,15 @@ from slam_observer_ros.observer.flat_arrays import (
     Observed,
     Seen,
 )
-from slam_observer_ros.observer.riccati.symmetric_matrix import (
-    add_symmetric_product,
-    subtract_square,
-)
 from slam_observer_ros.observer.robust import (
     are_far,
     far_from_the_others,
     huber_weights,
     REWEIGHTINGS,
+)
+from slam_observer_ros.observer.symmetric_matrix import (
+    add_symmetric_product,
+    subtract_square,
 )
 from slam_observer_ros.sensor_models.motion_noise import (
     Factors,

@@ -2,8 +2,8 @@
 
 V_true(t) = (1 + s) ∘ V(t − τ) + b. The delay τ is how much later than its stamp a velocity shows
 in what is observed: a command takes a while to be obeyed, and an image a while to be stamped. A
-sensor's part, which begins with the first observation from its frame, is in
-:mod:`.sensor_calibration`.
+sensor's part, ψ, d and s of :mod:`slam_observer_ros.geometry.sensor_mounting`, begins with the
+first observation from its frame.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
-from slam_observer_ros.sensor_models.sensor_calibration import SCALE, SensorCalibration
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 NAMES = (
@@ -39,6 +38,64 @@ estimate, which can't make up for it, would stray ever further.
 """
 
 UNITS = ('',) * 6 + ('rad/s',) * 3 + ('m/s',) * 3 + ('s',)
+
+SENSOR_NAMES = (
+    *(f'sensor_rotation_{axis}' for axis in 'xyz'),
+    *(f'sensor_translation_{axis}' for axis in 'xyz'),
+    'range_scale',
+)
+"""Names of ψ, d and e^s."""
+
+SENSOR_UNITS = ('rad',) * 3 + ('m',) * 3 + ('',)
+
+SCALE = SENSOR_NAMES.index('range_scale')
+
+
+class SensorCalibration:
+    """ψ, d and s of the sensor of one frame, and which of these seven are ``estimated`` (c_s,).
+
+    ``number`` counts the sensors. At the start the ``values`` (7,) are as stated, and the
+    estimates have ``variances`` (c_s,).
+    """
+
+    def __init__(
+        self,
+        frame: str,
+        number: int,
+        stated: FloatArray,
+        estimated: IntArray,
+        variances: FloatArray,
+    ) -> None:
+        self.frame, self.number = frame, number
+        self.estimated, self.variances = estimated, variances
+        self._stated, self.values = stated, stated.copy()
+
+    def shift(self, change: FloatArray) -> None:
+        """Add ``change`` (c_s,) to the estimates."""
+        values: FloatArray = self.values.copy()
+        values[self.estimated] += change
+        self.values = values
+
+    def estimates(self, variances: FloatArray, stated: FloatArray) -> list[CalibrationEstimate]:
+        """Return the estimates with ``variances`` (c_s,), and standard deviations at the start."""
+        suffix = f'/{self.frame}' if self.frame else ''
+        found = []
+        for i, variance, error in zip(self.estimated, variances, stated, strict=True):
+            value, nominal, factor = self.values[i], self._stated[i], 1.0
+            if i == SCALE:  # s is its logarithm
+                value, nominal = math.exp(value), math.exp(nominal)
+                factor = value
+            found.append(
+                CalibrationEstimate(
+                    SENSOR_NAMES[i] + suffix,
+                    float(value),
+                    float(factor * np.sqrt(variance)),
+                    SENSOR_UNITS[i],
+                    nominal=float(nominal),
+                    stated=float(factor * error),
+                )
+            )
+        return found
 
 
 class Calibration:
@@ -62,6 +119,7 @@ class Calibration:
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._nominal = stated_of_velocity(settings)
         self._all: FloatArray = self._nominal.copy()
+        self._values: FloatArray | None = None  # as asked for since the last change
         # τ; where it is negative the latest velocity is held for longer.
         self.delay_ns = to_ns(settings.velocity_delay)
         self.sensors: dict[str, SensorCalibration] = {}
@@ -92,7 +150,7 @@ class Calibration:
         """Append what is estimated of the sensor of a new frame."""
         number, variances = len(self.sensors), self._sensor_variances
         sensor = SensorCalibration(frame, number, self._stated, self._of_sensor, variances)
-        self.sensors[frame] = sensor
+        self.sensors[frame], self._values = sensor, None
         self.count += len(sensor.estimated)
         self._set_variances(np.append(self.initial_variances, sensor.variances))
         return sensor
@@ -100,11 +158,11 @@ class Calibration:
     @property
     def values(self) -> FloatArray:
         """(c,) estimates: scale factors 1 + s, biases b, the delay τ in seconds; then sensors'."""
-        values: FloatArray = self._all[self._estimated]
-        if not self.sensors:
-            return values
-        sensors = self.sensors.values()
-        return np.concatenate([values, *(part.values[part.estimated] for part in sensors)])
+        if self._values is None:
+            of_sensors = [part.values[part.estimated] for part in self.sensors.values()]
+            self._values = np.concatenate([self._all[self._estimated], *of_sensors])
+            self._values.setflags(write=False)
+        return self._values
 
     @property
     def calibrates_sensors(self) -> bool:
@@ -237,6 +295,7 @@ class Calibration:
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
+        self._values = None
         self._all[self._estimated] += change[: self.of_velocity]
         for sensor in self.sensors.values():
             sensor.shift(change[self.columns(sensor)])

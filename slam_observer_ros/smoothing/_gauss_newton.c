@@ -8,6 +8,7 @@
  *
  * All that could be read or written beyond an array's end is checked when the arrays come in, in
  * the functions named read_...; nothing is checked after them. Nothing is kept from call to call.
+ * Other threads run meanwhile: the equations are those of the caller alone.
  */
 #include "../observer/_door.h" /* first, as it includes Python.h */
 #include "../observer/_se3.h"
@@ -436,7 +437,7 @@ static int linearise(const Equations *eq, const Prior *prior, const Links *links
                      const Solution *at, const Weighing *weighing) {
     long N = prior->N, d = eq->d, q = 2 * d + eq->c;
     long size = N * (N + d + 2) + eq->k * prior->m * d + d * d, other = q * (q + 2 * d + 1);
-    double *work = PyMem_Malloc((size_t)(size > other ? size : other) * sizeof(double));
+    double *work = PyMem_RawMalloc((size_t)(size > other ? size : other) * sizeof(double));
     if (work == NULL)
         return 0;
     add_prior(eq, prior, at, work);
@@ -444,7 +445,7 @@ static int linearise(const Equations *eq, const Prior *prior, const Links *links
         add_motion(eq, links, at, s, work);
     for (long m = 0; m < eq->M; m++)
         add_point(eq, seen, at, weighing, m, work);
-    PyMem_Free(work);
+    PyMem_RawFree(work);
     return 1;
 }
 
@@ -674,8 +675,11 @@ static PyObject *py_linearise(PyObject *Py_UNUSED(self), PyObject *const *args, 
              && read_seen(&door, args[3], &eq, &seen)
              && (door.sizes['n'] = eq.n, read_fields(&door, args[4], SOLUTION, &at, "Solution"))
              && read_fields(&door, args[5], WEIGHING, &weighing, "Weighing")
-             && read_axes(&eq, &weighing))
+             && read_axes(&eq, &weighing)) {
+        Py_BEGIN_ALLOW_THREADS
         has_memory = linearise(&eq, &prior, &links, &seen, &at, &weighing);
+        Py_END_ALLOW_THREADS
+    }
     close_door(&door);
     if (!has_memory)
         return PyErr_NoMemory();
@@ -706,8 +710,10 @@ static PyObject *solved(PyObject *const *args, Py_ssize_t count, int fills_in) {
             PyErr_NoMemory();
         else {
             lay_out(&eq, &chain, memory, integers, &stretch);
+            Py_BEGIN_ALLOW_THREADS
             is_regular = fills_in ? fill_in(&eq, &chain, border, changes, &stretch)
                                   : eliminate(&eq, &chain, &stretch);
+            Py_END_ALLOW_THREADS
         }
         PyMem_Free(memory);
         PyMem_Free(integers);

@@ -303,10 +303,12 @@ class History:
 
     def _covariances(self, seen: list[Keyframe]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""
+        stated = [part.covariances for part in seen if part.covariances is not None]
+        if len(stated) == len(seen):
+            return np.concatenate(stated)
         covariances = self._observation_noise.at(
             np.concatenate([part.lines_of_sight for part in seen])
         )
-        stated = [part.covariances for part in seen if part.covariances is not None]
         if stated:
             is_stated = [part.covariances is not None for part in seen]
             covariances[np.repeat(is_stated, [len(part.rows) for part in seen])] = np.concatenate(

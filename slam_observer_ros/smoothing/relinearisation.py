@@ -28,9 +28,8 @@ from slam_observer_ros.common.errors import ParameterError, SmoothingError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.orientations import LandmarkOrientations
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
@@ -77,44 +76,36 @@ SLIP_TOLERANCE = 1e-4
 """Change below which a solution will do to judge slips by."""
 
 
-class JointFilter(Protocol):
-    """What there must be of a filter; its covariance may become one for large maps."""
+class KnownErrors(Protocol):
+    """What there must be of :class:`.Errors`; P may become one for large maps."""
 
     observer: Observer
-    calibration: Calibration
     axes: EstimatedAxes
-    joint: JointCovariance | None
-    orientations: LandmarkOrientations
-    estimates_orientations: bool
+    joint: JointCovariance
 
 
 class Relinearisation:
     """What a filter has seen since a prior, and when that is relinearised.
 
-    Relinearising changes ``filter_``, one with a joint covariance, given at its start.
+    Relinearising changes the observer and the covariance of ``errors``, and the ``calibration``.
     ``relinearization_*``, ``smoothing_window``, ``huber_threshold``, ``rejection_threshold`` and
     the noise of observations are read from the settings. ``history`` has what was seen.
     """
 
-    def __init__(
-        self,
-        filter_: JointFilter,
-        settings: Settings,
-    ) -> None:
-        self._filter, self._settings = filter_, settings
-        self._observer, self._calibration = filter_.observer, filter_.calibration
-        self._axes = filter_.axes
+    def __init__(self, errors: KnownErrors, calibration: Calibration, settings: Settings) -> None:
+        self._errors, self._settings, self._axes = errors, settings, errors.axes
+        self._observer, self._calibration = errors.observer, calibration
         self._observation_noise = ObservationNoise(settings)
         self._warning = _Warning()
         self._seen = self._observations = 0
         self._turn_squared = self._largest_turn = 0.0
         self.reset('the last start')
 
-    def copy(self, filter_: JointFilter) -> Relinearisation:
-        """Return an independent copy for a copy of the filter."""
+    def copy(self, errors: KnownErrors, calibration: Calibration) -> Relinearisation:
+        """Return an independent copy for a copy of errors and calibration."""
         other = copy(self)
-        other._filter, other._observer = filter_, filter_.observer
-        other._calibration, other.history = filter_.calibration, self.history.copy()
+        other._errors, other._observer = errors, errors.observer
+        other._calibration, other.history = calibration, self.history.copy()
         return other
 
     @property
@@ -245,10 +236,7 @@ class Relinearisation:
 
     @property
     def _joint(self) -> JointCovariance:
-        joint = self._filter.joint
-        if joint is None:
-            raise TypeError('a filter without a joint covariance has nothing to relinearise')
-        return joint
+        return self._errors.joint  # which may become one for large maps
 
     def _start(self, prior: Prior, since: str) -> None:
         self.history = History(self._axes, self._observation_noise, prior, since)
@@ -329,7 +317,7 @@ class Relinearisation:
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)
         if end.orientations is not None:
-            self._filter.orientations.B[...] = end.orientations
+            self._observer.orientations.B[...] = end.orientations
 
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
         calibration, sensed = self._calibration, None
@@ -365,8 +353,7 @@ class Relinearisation:
 
     def _orientations(self) -> FloatArray | None:
         """Return those of the landmarks (n, 3, 3), if they are estimated."""
-        filter_ = self._filter
-        return filter_.orientations.B.copy() if filter_.estimates_orientations else None
+        return self._observer.orientations.B.copy() if self._joint.chart.turn else None
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:

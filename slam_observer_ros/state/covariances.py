@@ -1,38 +1,53 @@
-"""Covariances as users know them, in the world or as seen from the robot, from the filter's.
+"""Covariances as users know them, in the world or as seen from the robot.
 
-The filter knows the error ε of Â = exp(ε) A and the errors ã_i of the landmarks, in the reference
-frame. Functions return None where it knows none.
+They are made of those of the error ε of Â = exp(ε) A and the errors ã_i of the landmarks, in the
+reference frame.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import limited, transpose
+from slam_observer_ros.observer.configuration import turned_moment
 from slam_observer_ros.observer.observer import Observer
 
 MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
 """Standard deviations of a given pose, rad and m, beyond which it is only 'unknown'."""
 
 
-def of_landmarks(observer: Observer, covariances: FloatArray | None) -> FloatArray | None:
+def of_landmarks(observer: Observer, covariances: FloatArray) -> FloatArray:
     """Return those of landmarks along the world's axes, given ``covariances`` of ã_i (n, 3, 3)."""
-    if covariances is None:
-        return None
     R = observer.reference_pose[:3, :3]
     world: FloatArray = R @ covariances @ R.T
     return world
 
 
-def of_pose(observer: Observer, covariance: FloatArray | None, A: FloatArray) -> FloatArray | None:
+def of_configuration(
+    observer: Observer, axes: EstimatedAxes, rows: IntArray, P: FloatArray
+) -> FloatArray:
+    """Return that of landmarks (m k, m k) as seen from the robot; ``P`` is of ε and ã_i."""
+    # Along the axes of the body: the choice of the world's frame has no part in it.
+    m, k, p = len(rows), axes.point, axes.p
+    C = axes.output_matrix(observer.points[rows]).reshape(-1, p)
+    CP = C @ P[:p] - P[p:]
+    seen_covariance = CP[:, :p] @ C.T - CP[:, p:]
+    turns = slice(p - k)
+    seen_covariance = turned_moment(seen_covariance, CP[:, turns], P[turns, turns])
+    blocks = seen_covariance.reshape(m, k, m, k).swapaxes(1, 2)
+    R = observer.A[:k, :k]
+    seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
+    return seen
+
+
+def of_pose(observer: Observer, covariance: FloatArray, A: FloatArray) -> FloatArray:
     """Return the pose's covariance (…, 6, 6) at Â = ``A`` (…, 4, 4), given that of ε (…, 6, 6).
 
     Of its rotation vector and its position along the world's axes, rad² and m².
     """
-    if covariance is None:
-        return None
     turn = _turn_to_world(observer, A)
     world: FloatArray = turn @ covariance @ transpose(turn)
     return world

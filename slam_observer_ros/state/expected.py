@@ -9,7 +9,7 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.step import LOG_ROOT_2_PI
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -25,14 +25,14 @@ class Expected:
     shares: FloatArray  # (m,) of an observation with new errors, that each is worth
 
     @classmethod
-    def of(cls, filter_: Filter, residuals: Residuals, error_time_s: float) -> Expected:
-        """Ask the filter, before it corrects itself; errors last for ``error_time_s``."""
-        r, _ = residuals.on(filter_.axes)
+    def of(cls, gains: Gains, residuals: Residuals, error_time_s: float) -> Expected:
+        """Ask gains, before they correct the state; errors last for ``error_time_s``."""
+        r, _ = residuals.on(gains.axes)
         repeated = repetition_factors(residuals.dt_s, error_time_s)
-        S = filter_.innovation_covariance(residuals) if len(r) else None
-        if S is not None:
+        if gains.errors is not None and len(r):
+            S = gains.errors.innovation_covariance(residuals)
             return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), S, 1.0 / repeated)
-        distances = filter_.distances(residuals) if len(r) else np.empty(0)
+        distances = gains.distances(residuals) if len(r) else np.empty(0)
         return cls(r, distances, None, 1.0 / repeated)
 
     def judge(self, weights: FloatArray) -> NormalisedInnovation:

@@ -29,7 +29,7 @@ def carried_forward(
     """
     # The motion of the robot since then, and that of the landmarks.
     interval = (event.stamp_ns, state_ns)
-    lag_s, calibration = to_s(state_ns - event.stamp_ns), state.filter.calibration
+    lag_s, calibration = to_s(state_ns - event.stamp_ns), state.calibration
     back = se3.inverse(transition(velocities, calibration, *interval))
     shifts = _landmark_velocities(state, event, state.observer.A @ back) * lag_s
     points = event.points + shifts
@@ -57,8 +57,6 @@ def carried_forward(
 def _landmark_velocities(state: State, event: ObservationEvent, A: FloatArray) -> FloatArray:
     """Return how the landmarks (m, 3) seen move, m/s, along the axes of the body at Â = ``A``."""
     velocities = np.zeros_like(event.points)
-    if state.is_fixed:
-        return velocities
     if not state.landmark_velocity_stddev:  # not estimated: as the sensor says
         return velocities if event.velocities is None else event.velocities
     rows = state.landmarks.rows_of(event.ids)

@@ -50,7 +50,7 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
 
 def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
     """Return an observation as it is by the calibration of its sensor, unless it is already."""
-    calibration = state.filter.calibration
+    calibration = state.calibration
     if not calibration.corrects_points or event.sensed is not None:
         return event
     if event.sensor_frame not in calibration.sensors:
@@ -60,7 +60,7 @@ def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
 
 def corrected_again(state: State, event: ObservationEvent) -> ObservationEvent:
     """Return an observation as it is by what a correction has made of the calibration."""
-    return sensing.corrected_again(state.filter.calibration, event)
+    return sensing.corrected_again(state.calibration, event)
 
 
 def sensitivity(
@@ -71,7 +71,7 @@ def sensitivity(
     None where nothing of a sensor is estimated.
     """
     points = event.points if points is None else points
-    D = sensing.point_sensitivity(state.filter.calibration, event, points)
+    D = sensing.point_sensitivity(state.calibration, event, points)
     return None if D is None else state.observer.A[:3, :3] @ D
 
 
@@ -89,7 +89,7 @@ def enter(state: State, event: ObservationEvent, noise: FloatArray) -> None:
     state.counts['unmapped_landmark'] += new - m
     if m:
         event = corrected_again(state, event.select(np.arange(new) < m))
-        state.filter.add(SeenPoints(event.points, noise[:m], sensitivity(state, event)))
+        state.gains.add(SeenPoints(event.points, noise[:m], sensitivity(state, event)))
         state.landmarks.add(event.ids, event.stamp_ns)
 
 
@@ -100,8 +100,9 @@ def residuals_of(
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
     D = None
     if event.sensed is not None:
-        D = sensitivity(state, event, state.filter.expected_points(rows))
-    return state.filter.residuals(rows, SeenPoints(event.points, covariances, D), dt_s)
+        state.gains.prepare(rows)
+        D = sensitivity(state, event, state.observer.body_points(rows))
+    return state.gains.residuals(rows, SeenPoints(event.points, covariances, D), dt_s)
 
 
 def keyframe_of(
@@ -144,6 +145,7 @@ def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> 
     the robot. The bearing is the measured one: the sensor knows it better than a state whose
     heading is yet to be corrected.
     """
+    state.gains.prepare(rows)
     measured, expected = event.lines_of_sight, _lines_of_sight(state, event, rows)
     expected_squared = np.einsum('ij,ij->i', expected, expected)
     measured_squared = np.einsum('ij,ij->i', measured, measured)
@@ -176,7 +178,7 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     is_confirmed = landmarks.counts.take(rows, mode='wrap') >= settings.confirmations
     in_doubt = landmarks.in_doubt(rows, settings.max_rejections)
     is_sure = (rows >= 0) & is_confirmed & ~in_doubt
-    points = state.filter.expected_points(rows)
+    points = state.observer.body_points(rows)
     if np.count_nonzero(is_sure) < len(rows):
         points = np.where(is_sure[:, None], points, event.points)
     return points if event.sensor is None else points - event.sensor

@@ -1,4 +1,4 @@
-"""One hypothesis of pose and map: a filter, its landmarks, and their history."""
+"""One hypothesis of pose and map: gains, what is known of errors, landmarks, and history."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.gains import Errors, Gains
+from slam_observer_ros.observer.joint_covariance import JointCovariance
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
 from slam_observer_ros.sensor_models.motion import Motion, Passage
@@ -27,20 +29,23 @@ from slam_observer_ros.state.landmark_table import LandmarkTable
 class State:
     """Pose and map as of one instant; :mod:`.step` moves it on."""
 
-    def __init__(self, filter_: Filter, settings: Settings) -> None:
+    def __init__(self, gains: Gains, settings: Settings) -> None:
         self.settings = settings  # those in force
         self.judges_innovations = False  # which takes time, and is for those who look at them
         self.is_mapping = True  # landmarks are added, and relocated if rejected too often
-        self.filter = filter_  # X̂, and what is known of its errors
-        self.observer, self.axes = self.filter.observer, self.filter.axes
+        self.gains, self.errors = gains, gains.errors  # what moves X̂, what is known of its errors
+        self.observer, self.axes = gains.observer, gains.axes
+        self.calibration, self.motion_noise = gains.calibration, gains.motion_noise
         self.landmarks = LandmarkTable()
-        self.relinearisation: Relinearisation | None = None  # where the filter needs it
-        if filter_.joint is not None and not self.landmark_velocity_stddev:
-            self.relinearisation = Relinearisation(filter_, settings)
+        # How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it.
+        is_ignored = 'landmark_velocity_stddev' in gains.ignores
+        self.landmark_velocity_stddev = 0.0 if is_ignored else settings.landmark_velocity_stddev
+        self.relinearisation: Relinearisation | None = None  # where errors are known
+        if self.errors is not None and not self.landmark_velocity_stddev:
+            self.relinearisation = Relinearisation(self.errors, self.calibration, settings)
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
         self.was_contradicted = False  # most known landmarks seen last were rejected
-        self.motion_noise = filter_.motion_noise
         self.observation_noise = ObservationNoise(settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
@@ -48,23 +53,26 @@ class State:
     def copy(self) -> State:
         """Return an independent copy: one copy of memory an array."""
         other = copy(self)
-        other.filter = filter_ = self.filter.copy()
-        other.observer, other.motion_noise = filter_.observer, filter_.motion_noise
+        other.gains = gains = self.gains.copy()
+        other.observer, other.errors = gains.observer, gains.errors
+        other.calibration, other.motion_noise = gains.calibration, gains.motion_noise
         other.landmarks, other.counts = self.landmarks.copy(), self.counts.copy()
         if self.relinearisation is not None:
-            other.relinearisation = self.relinearisation.copy(filter_)
+            past = self.relinearisation.copy(other.known_errors, other.calibration)
+            other.relinearisation = past
         return other
 
     @property
-    def is_fixed(self) -> bool:
-        """Whether the landmarks are those of a map that is exact, and at rest."""
-        return not self.is_mapping and self.settings.localization_mode == 'fixed'
+    def joint(self) -> JointCovariance | None:
+        """P, in the form that suits the map, of gains that know it."""
+        return None if self.errors is None else self.errors.joint
 
     @property
-    def landmark_velocity_stddev(self) -> float:
-        """How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it."""
-        is_ignored = 'landmark_velocity_stddev' in self.filter.ignores
-        return 0.0 if self.is_fixed or is_ignored else self.settings.landmark_velocity_stddev
+    def known_errors(self) -> Errors:
+        """What is known of the errors, where association asks, which needs that."""
+        if self.errors is None:
+            raise TypeError('these gains know no joint covariance')
+        return self.errors
 
     @property
     def confirmed(self) -> IntArray:
@@ -78,9 +86,20 @@ class State:
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:
         """Return those (n, 3, 3) of landmarks after ``duration_s``, world, m²; or None."""
+        if self.errors is None:
+            return None
         return covariances.of_landmarks(
-            self.observer, self.filter.landmark_covariances(duration_s)
+            self.observer, self.errors.landmark_covariances(duration_s)
         )
+
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
+
+        None in an exact map, or where gains know none.
+        """
+        if (P := self.gains.joint_covariance(rows)) is None:
+            return None
+        return covariances.of_configuration(self.observer, self.axes, rows, P)
 
     def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
@@ -91,16 +110,20 @@ class State:
         """
         motion = self.motion(velocities, start_ns, end_ns)
         A = motion.path[-1]
-        covariance = self.filter.pose_covariance(motion)
-        return self.observer.reference_pose @ A, covariances.of_pose(self.observer, covariance, A)
+        return self.observer.reference_pose @ A, self._pose_covariance(motion, A)
 
     def poses_until(
         self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then."""
         passage = self.passage(velocities, start_ns, stamps_ns, with_covariances=True)
-        covariance, A = self.filter.pose_covariance(passage), passage.poses
-        return self.observer.reference_pose @ A, covariances.of_pose(self.observer, covariance, A)
+        A = passage.poses
+        return self.observer.reference_pose @ A, self._pose_covariance(passage, A)
+
+    def _pose_covariance(self, motion: Motion | Passage, A: FloatArray) -> FloatArray | None:
+        if self.errors is None:
+            return None
+        return covariances.of_pose(self.observer, self.errors.pose_covariance(motion), A)
 
     def passage(
         self,
@@ -112,7 +135,7 @@ class State:
         """Return how the robot moves from the state's stamp through ``stamps_ns`` (s,)."""
         return integrate_until(
             velocities,
-            self.filter.calibration,
+            self.calibration,
             self.motion_noise,
             self.observer.A,
             start_ns,
@@ -125,7 +148,7 @@ class State:
         """Return how the robot moves from the state's stamp ``start_ns`` to ``end_ns``."""
         return integrate(
             velocities,
-            self.filter.calibration,
+            self.calibration,
             self.motion_noise,
             self.observer.A,
             start_ns,
@@ -135,7 +158,7 @@ class State:
 
     def propagate(self, motion: Motion) -> None:
         """Move on along a motion (27)."""
-        self.filter.propagate(motion)
+        self.gains.advance(motion)
         if self.relinearisation is not None:
             self.relinearisation.move(motion)
         if motion.at_ends is not None:
@@ -153,7 +176,7 @@ class State:
         A = se3.inverse(observer.reference_pose) @ pose
         observer.set_pose(A)
         given = np.zeros((6, 6)) if covariance is None else covariance
-        self.filter.set_pose(A, covariances.of_pose_error(observer, given))
+        self.gains.set_pose(A, covariances.of_pose_error(observer, given))
         self.was_contradicted = False
         self.forget_past('the pose was set')
 
@@ -171,13 +194,13 @@ class State:
 
     def add_sensor(self, frame: str) -> None:
         """Begin to calibrate the sensor of another frame."""
-        self.filter.add_sensor(frame)
+        self.gains.add_sensor(frame)
         if self.relinearisation is not None:
             self.relinearisation.add_calibration()
 
     def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
         """Take landmarks (m,) for new ones."""
-        self.filter.relocate(rows, seen)
+        self.gains.relocate(rows, seen)
         if self.relinearisation is not None:
             self.relinearisation.relocate(rows)
 
@@ -185,12 +208,12 @@ class State:
         """Forget the landmarks at ``rows``; those behind move up."""
         if self.relinearisation is not None:
             self.relinearisation.remove(rows)
-        self.filter.remove(rows)
+        self.gains.remove(rows)
         self.landmarks.remove(rows)
 
     def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
-        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit; see the filter's merge."""
-        square = self.filter.merge(rows, copies, most)
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: :meth:`.Gains.merge`."""
+        square = self.gains.merge(rows, copies, most)
         if square <= most:
             self.landmarks.merge(rows, copies)
             if self.relinearisation is not None:
@@ -204,14 +227,15 @@ class State:
             self.remove(rows)
             self.counts[why] += len(rows)
 
-    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Take all landmarks for exact and at rest; see :meth:`.Filter.fix_landmarks`."""
-        self.filter.fix_landmarks(y_ref, covariances)
+    def fix_landmarks(self, known: KnownLandmarks) -> None:
+        """Take all landmarks for exact and at rest where a map has them."""
+        self.gains.fix_landmarks(known)
+        self.landmark_velocity_stddev = 0.0
         self.relinearisation = None  # there is no drift to undo
 
     def smooth(self) -> Smoothed:
         """Return the smoothed trajectory and map; see :meth:`.Relinearisation.smooth`."""
-        if self.is_fixed:
+        if self.observer.is_exact:
             raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
         if self.landmark_velocity_stddev:
             raise ParameterError(
@@ -223,7 +247,7 @@ class State:
             )
         # From the reference frame to the world.
         (step, slips), rows = self.relinearisation.smooth(), self.confirmed
-        found, calibration = step.end, self.filter.calibration.copy()
+        found, calibration = step.end, self.calibration.copy()
         entries = slice(self.axes.p, self.axes.p + calibration.count)
         covariance = step.marginal()[entries, entries]
         calibration.shift(found.calibrations[-1] - calibration.values)

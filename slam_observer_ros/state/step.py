@@ -30,20 +30,17 @@ from slam_observer_ros.state.usual import Outcome
 
 def step(state: State, matched: MatchedObservation) -> Outcome:
     """One step of the observer (28), from where the velocity has led it (27): the innovation."""
-    if matched.known.orientations is not None:
-        state.filter.learn_motion_noise(matched.residuals)
-        matched = correct_by_orientations(state, matched)  # φ_i = log(R_Â Z_i B̂_iᵀ)
+    matched = correct_by_orientations(state, matched)  # φ_i = log(R_Â Z_i B̂_iᵀ)
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     _drop_history_if_full(state, matched)
     expected = None
     if state.judges_innovations:
-        expected = Expected.of(state.filter, residuals, state.observation_noise.error_time_s)
+        expected = Expected.of(state.gains, residuals, state.observation_noise.error_time_s)
     weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
     rejected = weights == 0.0
     _count(state, matched, rejected)
     event, rows = _add_new(state, matched)  # y_i° = Â y_i
-    if event.orientations is not None:
-        take_over_orientations(state, event, rows)  # B̂_i = R_Â Z_i
+    take_over_orientations(state, event, rows)  # B̂_i = R_Â Z_i
     moved_ids = _relinearise(state, event, rows)
     _set_velocities(state, event, rows)  # (19)
     innovation = None if expected is None else expected.judge(weights)
@@ -55,7 +52,7 @@ def _correct(state: State, residuals: Residuals) -> FloatArray:
     if not len(residuals.rows):
         return np.empty(0)
     before = state.observer.A.copy()
-    weights = state.filter.correct(residuals)
+    weights = state.gains.observe(residuals)
     if state.relinearisation is not None:
         state.relinearisation.note_correction(before, state.observer.A)
     return weights
@@ -83,7 +80,7 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
     some_are = bool(np.count_nonzero(in_doubt))
     past = state.relinearisation
     if past is not None and past.is_active:
-        turns = seen_orientations(state, event, rows) if event.orientations is not None else None
+        turns = seen_orientations(state, event, rows)
         past.add(keyframe_of(state, event, rows, turns), some_are)
     if some_are:
         return _relocate_moved(state, event.select(in_doubt), rows[in_doubt])
@@ -112,7 +109,7 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     event = corrected_again(state, event)
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
-    far = state.filter.distances(residuals) > state.settings.rejection_threshold
+    far = state.gains.distances(residuals) > state.settings.rejection_threshold
     moved = far & (state.landmarks.counts[rows] >= state.settings.confirmations)
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
@@ -129,7 +126,7 @@ def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> No
     velocities = event.velocities
     if velocities is None and state.observer.have_moved:
         velocities = np.zeros((len(rows), 3))
-    if velocities is None or state.landmark_velocity_stddev or state.is_fixed:
+    if velocities is None or state.landmark_velocity_stddev:
         return
     used = state.landmarks.rejections[rows] == 0
     state.observer.set_landmark_velocities(rows[used], velocities[used])

@@ -26,16 +26,17 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
     Of points that are too far off to be used orientations are not, either. An orientation that is
     rejected leaves its landmark a point, as seen this time.
     """
-    tags, event, rows = state.filter.orientations, matched.known, matched.residuals.rows
-    if event.orientations is None or not len(rows):
+    gains, event, rows = state.gains.tags, matched.known, matched.residuals.rows
+    if gains is None or event.orientations is None or not len(rows):
         return matched
-    gate = state.settings.rejection_threshold
-    are_near = state.filter.distances(matched.residuals) <= gate
+    gains.learn_motion_noise(matched.residuals)
+    tags, gate = state.observer.orientations, state.settings.rejection_threshold
+    are_near = state.gains.distances(matched.residuals) <= gate
     seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
     if not len(seen.rows):
         return matched
     before = state.observer.A.copy()
-    weights, are_unclear = state.filter.correct_by_orientations(seen)
+    weights, are_unclear = gains.correct_by_orientations(seen)
     if state.relinearisation is not None:
         state.relinearisation.note_correction(before, state.observer.A)
     judged = ~are_unclear
@@ -53,8 +54,8 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
     One is wrong that was rejected more often than it was seen, or ``max_rejections`` times, all
     in a row.
     """
-    tags, Z = state.filter.orientations, event.orientations
-    if Z is None or state.is_fixed:
+    gains, tags, Z = state.gains.tags, state.observer.orientations, event.orientations
+    if gains is None or Z is None or state.observer.is_exact:
         return
     in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     is_used = state.landmarks.rejections[rows] == 0
@@ -66,7 +67,7 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
     replaced = seen.rows[tags.are_known[seen.rows]]
     if state.relinearisation is not None and len(replaced):
         state.relinearisation.forget_orientations(replaced)
-    state.filter.add_orientations(seen)
+    gains.add_orientations(seen)
 
 
 def seen_orientations(
@@ -109,7 +110,7 @@ def _all_seen(
     """Return the orientations (m, 3, 3) in an observation, with their noise."""
     noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    twins, D = flipped(Z, event.lines_of_sight), turn_sensitivity(state.filter.calibration, event)
+    twins, D = flipped(Z, event.lines_of_sight), turn_sensitivity(state.calibration, event)
     if D is not None:
         D = state.observer.A[:3, :3] @ D
     return SeenOrientations(rows, Z, twins, noise, dt_s, D)
@@ -120,6 +121,6 @@ def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:
 
     By that which is seen a tag that seems to be tilted would be trusted more than a frontal one.
     """
-    tags = state.filter.orientations
+    tags = state.observer.orientations
     expected: FloatArray = state.observer.A[:3, :3].T @ tags.B[rows]
     return np.where(tags.are_known[rows][:, None, None], expected, Z)

@@ -72,7 +72,7 @@ def advance(
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    calibration, joint = state.filter.calibration, state.filter.joint
+    calibration, joint = state.calibration, state.joint
     if joint is not None:
         joint.note_motion()
     if state.relinearisation is not None and state.relinearisation.is_active:
@@ -116,7 +116,7 @@ def _led_to(
 
     Until each instant along what is known of velocities then.
     """
-    joint, axes = state.filter.joint, state.axes
+    joint, axes = state.joint, state.axes
     if joint is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
     # Landmarks have no part in it.
@@ -180,7 +180,7 @@ def takes(state: State, event: ObservationEvent) -> bool:
 
     Made at the state's instant, by a sensor that is known.
     """
-    calibration = state.filter.calibration
+    calibration = state.calibration
     return (
         event.velocities is None
         and event.orientations is None
@@ -201,7 +201,7 @@ def correct(
 
     Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
     """
-    m, k, joint = len(rows), state.axes.point, state.filter.joint
+    m, k, joint = len(rows), state.axes.point, state.joint
     if joint is None or not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
         return None
     joint.activate(rows)
@@ -248,7 +248,7 @@ def correct(
             for column, changed in zip(columns, landmarks, strict=True):
                 column[rows] = changed[places]
             joint.follow(out.moved)
-        calibration, p = state.filter.calibration, state.axes.p
+        calibration, p = state.calibration, state.axes.p
         if calibration.count:
             calibration.shift(out.moved[p : p + calibration.count])
         state.rejected_in_a_row, state.was_contradicted = 0, False
@@ -257,7 +257,7 @@ def correct(
 
 def _estimate(state: State) -> Estimate | None:
     """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
-    joint, observer = state.filter.joint, state.observer
+    joint, observer = state.joint, state.observer
     if joint is None or not _is_of_points(state):
         return None
     matrix, active = joint._matrix, joint.active
@@ -273,7 +273,7 @@ def _estimate(state: State) -> Estimate | None:
 
 def _is_of_points(state: State) -> bool:
     """Return whether what is estimated is a map of points at rest, and no more of them."""
-    joint = state.filter.joint
+    joint = state.joint
     return (
         joint is not None
         and not isinstance(joint, ExactMapCovariance)
@@ -285,7 +285,7 @@ def _is_of_points(state: State) -> bool:
 def _estimate_of(
     state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, size: int, first: int
 ) -> Estimate:
-    calibration = state.filter.calibration
+    calibration = state.calibration
     return Estimate(
         state.observer.A,
         y_ref,
@@ -309,7 +309,7 @@ def _advanced(
 
 
 def _interval(state: State, start_ns: int, end_ns: int) -> Interval:
-    calibration = state.filter.calibration
+    calibration = state.calibration
     return Interval(
         start_ns,
         end_ns,
@@ -320,7 +320,7 @@ def _interval(state: State, start_ns: int, end_ns: int) -> Interval:
 
 
 def _room_for_motion(state: State) -> Advanced:
-    p, c = state.axes.p, state.filter.calibration.count
+    p, c = state.axes.p, state.calibration.count
     return Advanced(
         np.empty((4, 4)),
         np.empty((p, p)),
@@ -335,7 +335,7 @@ def _seen(state: State, event: ObservationEvent, places: IntArray) -> Seen:
     """Return points of landmarks at ``places`` of P, and what of their sensor is calibrated."""
     arms, covariances = _plain(event.lines_of_sight), event.covariances
     origins = event.sensor
-    calibration = state.filter.calibration
+    calibration = state.calibration
     values, estimated, column = None, NO_IDS, 0
     if calibration.corrects_points:
         sensor = calibration.sensors[event.sensor_frame]
@@ -367,7 +367,7 @@ def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Key
     """Return what is needed to linearise again what was seen."""
     seen, out, sensed = corrected.seen, corrected.out, None
     if seen.sensor is not None:
-        number = state.filter.calibration.sensors[event.sensor_frame].number
+        number = state.calibration.sensors[event.sensor_frame].number
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
     stated = out.covariances if len(out.covariances) else None

@@ -75,7 +75,7 @@ def test_after_a_slip_the_pose_is_as_uncertain_as_the_slip_was_large_up_to_a_lim
             estimator.add(ObservationEvent(step * 10**8, ids, point))
         state, seen = estimator._hypotheses.best, point + [[shift_m, 0.0, 0.0]]
         slip(state, match(state, ObservationEvent(4 * 10**8, ids, seen)))
-        return np.trace(state.filter.pose_covariance()[3:, 3:])
+        return np.trace(state.errors.pose_covariance()[3:, 3:])
 
     assert 2.0 * variance_m2(0.3) < variance_m2(0.6) < 0.5 * variance_m2(2.0)
     assert variance_m2(3.0) == pytest.approx(variance_m2(2.0), rel=0.01)

@@ -193,7 +193,7 @@ def test_of_a_large_cloud_without_ids_those_nearest_are_weighed_and_the_others_c
     known = estimator._state.landmarks.ids
     assert len(known) == MAX_WEIGHED
     assert set(known[known < 10]) == {1, 2, 3}
-    own = np.linalg.norm(estimator._state.filter.world_points[known > 10], axis=1)
+    own = np.linalg.norm(estimator._state.observer.world_points[known > 10], axis=1)
     all_of_them = np.linalg.norm(cloud(m, ids).points[:-3], axis=1)
     np.testing.assert_allclose(np.sort(own), np.sort(all_of_them)[: len(own)], atol=1e-6)
     assert estimator.counts['unweighed_point'] == 2 * (m - MAX_WEIGHED)
@@ -223,4 +223,4 @@ def test_an_estimate_that_settings_lead_out_of_all_bounds_starts_again_and_says_
         assert estimator.add(ObservationEvent(1200 * 10**9 + k, IDS, POINTS))
     assert estimator.counts['diverged'] == 1
     assert 'The estimate has diverged: the pose is 1.2e+09 m from its origin' in caplog.text
-    np.testing.assert_allclose(estimator._state.filter.world_points, POINTS)
+    np.testing.assert_allclose(estimator._state.observer.world_points, POINTS)

@@ -13,7 +13,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SETTINGS = Settings(reorder_window=0.0, max_landmarks=0)
@@ -21,12 +21,12 @@ SETTINGS = Settings(reorder_window=0.0, max_landmarks=0)
 
 @pytest.fixture(autouse=True)
 def _few_landmarks_are_many(monkeypatch):
-    monkeypatch.setattr(RiccatiFilter, 'block', BlockSize(dense=8, most=8, kept=4))
+    monkeypatch.setattr(RiccatiGains, 'block', BlockSize(dense=8, most=8, kept=4))
 
 
 def dense(world, settings, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(RiccatiFilter, 'block', BlockSize(dense=10**9))
+        patch.setattr(RiccatiGains, 'block', BlockSize(dense=10**9))
         return estimate(world, replace(settings, relinearization_interval=0))
 
 

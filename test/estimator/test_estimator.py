@@ -36,7 +36,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.designs import make_filter
+from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -266,7 +266,7 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(m, a
         angular_velocity_noise=(0.0, 0.0, 0.2),
         linear_velocity_noise=(0.3, 0.0, 0.0),
     )
-    timeline = Timeline(Hypotheses(State(make_filter(settings, np.eye(4)), settings)), settings)
+    timeline = Timeline(Hypotheses(State(make_gains(settings, np.eye(4)), settings)), settings)
     turning = np.array([0.0, 0.0, 1e-9, 0.0, 0.0, 0.0])
     for step in range(21):
         timeline.append(queued(velocity(0.1 * step, turning)))
@@ -290,7 +290,7 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
         linear_velocity_noise=still,
         landmark_velocity_stddev=0.5 * is_estimated,
     )
-    hypotheses = Hypotheses(State(make_filter(settings, np.eye(4)), settings))
+    hypotheses = Hypotheses(State(make_gains(settings, np.eye(4)), settings))
     timeline = Timeline(hypotheses, settings)
     turning = np.array([0.0, 0.0, turn_rad / 0.9, 0.0, 0.0, 0.0])
     for step in range(11):
@@ -1098,14 +1098,14 @@ def test_gains_that_estimate_no_velocities_of_landmarks_take_them_as_messages_sa
 def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
     """Scheduled gains put off moving those that were out of view."""
     settings = Settings(gains='scheduled', confirmations=1)
-    state = State(make_filter(settings, np.eye(4)), settings)
+    state = State(make_gains(settings, np.eye(4)), settings)
     event = observation(0.0, [0, 1])
     state_step.step(state, match(state, event))
-    state.filter.expected_points = Mock(return_value=event.points)
+    state.observer.body_points = Mock(return_value=event.points)
     velocities = VelocityHistory(timeout_ns=10**9)
     velocities.append(queued(velocity(0.0, np.zeros(6))))
     carried_forward(state, event, velocities, event.stamp_ns + 10**8)
-    np.testing.assert_array_equal(state.filter.expected_points.call_args.args[0], [0, 1])
+    np.testing.assert_array_equal(state.observer.body_points.call_args.args[0], [0, 1])
 
 
 def test_a_landmark_that_is_placed_again_moves_as_its_sensor_says_from_then_on():

@@ -77,7 +77,7 @@ def test_other_gains_use_the_position_and_say_so(gains, caplog):
 
 def test_landmarks_that_may_move_are_points_and_it_is_said(caplog):
     estimator = Estimator(replace(SETTINGS, landmark_velocity_stddev=0.1))
-    assert not estimator._state.filter.estimates_orientations
+    assert estimator._state.gains.tags is None
     (message,) = caplog.messages
     assert message.startswith('use_tag_orientation has no effect')
     assert 'set landmark_velocity_stddev: 0.0' in message
@@ -93,7 +93,7 @@ def test_one_in_ten_that_is_flipped_does_no_harm():
 
 def test_an_orientation_that_was_flipped_when_it_was_new_is_replaced():
     estimator = drive(replace(UNSURE, angular_velocity_noise=(0.01,) * 3), 0.0, flips=[0])
-    orientations = estimator._state.filter.orientations
+    orientations = estimator._state.observer.orientations
     turn = so3.log(estimator.pose[:3, :3].T @ orientations.B[0] @ FACING.T)
     np.testing.assert_allclose(turn, 0.0, atol=0.03)
     assert estimator.counts['rejected_orientation'] < 5
@@ -106,7 +106,7 @@ def test_points_and_tags_may_be_in_one_observation():
     for k in range(5):
         event = ObservationEvent(k * 10**8, np.array([1, 2]), points)
         assert estimator.add(replace(event, orientations=orientations))
-    are_known = estimator._state.filter.orientations.are_known
+    are_known = estimator._state.observer.orientations.are_known
     np.testing.assert_array_equal(are_known, [True, False])
 
 

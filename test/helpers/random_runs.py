@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -25,49 +25,50 @@ DT_S = 0.1
 
 
 def propagate(
-    filter_: Filter, body_velocities: FloatArray, dt_s: FloatArray, covariances: FloatArray
+    filter_: Gains, body_velocities: FloatArray, dt_s: FloatArray, covariances: FloatArray
 ) -> None:
     """Move along velocities (k, 6), held for ``dt_s`` (k,), motions of covariances (k, 6, 6)."""
-    V = filter_.calibration.apply(body_velocities)
+    calibration = filter_.calibration
+    V = calibration.apply(body_velocities)
     path = se3.path(filter_.observer.A, V * dt_s[:, None])
     duration_s, at_ends = float(dt_s.sum()), np.zeros((2, 6))
-    filter_.propagate(
-        Motion(path, body_velocities, dt_s, covariances, duration_s, at_ends, filter_.calibration)
+    filter_.advance(
+        Motion(path, body_velocities, dt_s, covariances, duration_s, at_ends, calibration)
     )
 
 
 def residuals_of(
-    filter_: Filter, rows: IntArray, points: FloatArray, covariances: FloatArray
+    filter_: Gains, rows: IntArray, points: FloatArray, covariances: FloatArray
 ) -> Residuals:
     """Residuals of landmarks (m,) that are seen at ``points`` (m, 3), body frame."""
-    filter_.expected_points(rows)  # brings up to date what is postponed
+    filter_.prepare(rows)
     return filter_.residuals(rows, SeenPoints(points, covariances), np.full(len(rows), DT_S))
 
 
 def observe(
-    filter_: Filter, rows: IntArray, points: FloatArray, covariances: FloatArray
+    filter_: Gains, rows: IntArray, points: FloatArray, covariances: FloatArray
 ) -> FloatArray:
     """Correct a filter by landmarks (m,) seen at ``points`` (m, 3); return their weights."""
-    return filter_.correct(residuals_of(filter_, rows, points, covariances))
+    return filter_.observe(residuals_of(filter_, rows, points, covariances))
 
 
 def random_step(
-    filter_: Filter, rng: np.random.Generator, motion_variance: float, point_variance: float
+    filter_: Gains, rng: np.random.Generator, motion_variance: float, point_variance: float
 ) -> None:
     """One random motion and one random observation of some of the landmarks."""
     V = rng.normal(size=(2, 6))
     Q = motion_variance * random_covariances(rng, 2, 6)
     propagate(filter_, V, np.array([0.05, 0.1]), Q)
-    n = len(filter_.points)
+    n = len(filter_.observer.points)
     rows = np.sort(rng.permutation(n)[: rng.integers(1, n)])
-    points = filter_.expected_points(rows)
+    points = filter_.observer.body_points(rows)
     points = points + np.sqrt(point_variance) * rng.normal(size=points.shape)
     observe(filter_, rows, points, point_variance * random_covariances(rng, len(rows), 3))
 
 
-def covariance_of_all(filter_: Filter) -> FloatArray:
+def covariance_of_all(filter_: Gains) -> FloatArray:
     """Joint covariance of the pose and all landmarks."""
-    return filter_.joint_covariance(np.arange(len(filter_.points)))
+    return filter_.joint_covariance(np.arange(len(filter_.observer.points)))
 
 
 def random_covariances(rng: np.random.Generator, count: int, size: int) -> FloatArray:

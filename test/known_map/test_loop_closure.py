@@ -13,7 +13,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.loop_closure import LoopClosure
-from slam_observer_ros.observer.designs import make_filter
+from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -41,9 +41,9 @@ def grid():
 def after_a_loop(points, seen, seed=0):
     """A state with old landmarks, of which it has mapped ``seen`` again after drifting."""
     rng = np.random.default_rng(seed)
-    state = State(make_filter(PLANAR, np.eye(4)), PLANAR)
+    state = State(make_gains(PLANAR, np.eye(4)), PLANAR)
     old = np.arange(len(points))
-    state.filter.add_known(KnownLandmarks(points, np.tile(1e-4 * np.eye(3), (len(points), 1, 1))))
+    state.gains.add_known(KnownLandmarks(points, np.tile(1e-4 * np.eye(3), (len(points), 1, 1))))
     state.landmarks.add(FIRST_AUTOMATIC_ID + old, 0)
     true_pose = se3.from_rpy((6.0, 6.0, 0.0, 0.0, 0.0, 0.5))
     drift = rng.normal(size=3) * [TURN_RAD, SHIFT_M, SHIFT_M]
@@ -52,7 +52,7 @@ def after_a_loop(points, seen, seed=0):
     state.set_pose(pose, covariance)
     noise = SIGMA_M * np.pad(rng.normal(size=(len(seen), 2)), ((0, 0), (0, 1)))
     body = se3.transform(se3.inverse(true_pose), points[seen]) + noise
-    state.filter.add(SeenPoints(body, np.tile(SIGMA_M**2 * np.eye(3), (len(seen), 1, 1))))
+    state.gains.add(SeenPoints(body, np.tile(SIGMA_M**2 * np.eye(3), (len(seen), 1, 1))))
     state.landmarks.add(FIRST_AUTOMATIC_ID + len(points) + np.arange(len(seen)), LOOP_NS)
     state.landmarks.counts[:] = 9
     state.landmarks.tentative[:] = False
@@ -69,7 +69,7 @@ def test_a_loop_closes_where_new_landmarks_lie_to_each_other_as_old_ones(seed):
     assert_allclose(state.observer.pose, true_pose, atol=0.1)
     assert state.landmarks.ids.tolist() == (FIRST_AUTOMATIC_ID + np.arange(16)).tolist()
     assert state.landmarks.counts[seen].tolist() == [18] * len(seen)
-    assert_allclose(state.filter.points, points, atol=0.1)
+    assert_allclose(state.observer.points, points, atol=0.1)
     assert state.counts['merged_landmark'] == len(seen)
 
 
@@ -110,9 +110,9 @@ def twins(apart_m):
     points = np.concatenate(
         [points_in_a_hall(3), [[15.0, 15.0, 0.0], [15.0 + apart_m, 15.0, 0.0]]]
     )
-    state = State(make_filter(PLANAR, np.eye(4)), PLANAR)
+    state = State(make_gains(PLANAR, np.eye(4)), PLANAR)
     covariances = np.tile(SIGMA_M**2 * np.eye(3), (len(points), 1, 1))
-    state.filter.add_known(KnownLandmarks(points, covariances))
+    state.gains.add_known(KnownLandmarks(points, covariances))
     state.landmarks.add(FIRST_AUTOMATIC_ID + np.arange(len(points)), 0)
     state.landmarks.counts[:] = 9
     state.landmarks.tentative[:] = False
@@ -124,9 +124,9 @@ def twins(apart_m):
 def test_two_landmarks_are_one_if_they_are_as_near_each_other_as_they_are_known(apart_m, merged):
     state = twins(apart_m)
     assert LoopClosure().merge_twins(state) == merged
-    assert len(state.landmarks) == len(state.filter.points) == 18 - merged
+    assert len(state.landmarks) == len(state.observer.points) == 18 - merged
     if merged:
-        assert_allclose(state.filter.points[16], [15.01, 15.0, 0.0], atol=2e-3)
+        assert_allclose(state.observer.points[16], [15.01, 15.0, 0.0], atol=2e-3)
         assert state.landmarks.counts[16] == 18
         assert state.landmarks.last_seen_ns[16] == 5
 

@@ -30,7 +30,7 @@ from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -220,7 +220,7 @@ class TestInAnotherFrame:
         )
 
 
-def mapped(rng, settings, n=8, design=RiccatiFilter):
+def mapped(rng, settings, n=8, design=RiccatiGains):
     """A filter that has seen n landmarks, and moved."""
     flat = np.array([1.0, 1.0, not settings.two_d_mode])
     filter_ = design(settings, np.eye(4))
@@ -237,7 +237,7 @@ def known_by_a_map(rng, filter_, rows, others):
     flat = np.array([1.0, 1.0, filter_.axes.p != 3])
     off = 1e-6 * rng.standard_normal((len(rows), 3)) * flat
     more = rng.uniform(-9.0, 9.0, (others, 3)) * flat
-    points = np.vstack([filter_.points[rows] + off, more])
+    points = np.vstack([filter_.observer.points[rows] + off, more])
     joint = random_joint(rng, len(points))
     return KnownLandmarks(points, diagonal_blocks(joint, 3).copy(), joint)
 
@@ -248,7 +248,7 @@ def test_a_map_is_entered_as_by_a_kalman_filter_of_all_errors_together(settings,
     """The gauge of the estimate is one more error there, of which all but nothing is known."""
     filter_, rows = mapped(rng, settings), np.array([6, 1, 3, 4])
     known = known_by_a_map(rng, filter_, rows, others=3)
-    p, k, points = filter_.axes.p, filter_.axes.point, filter_.points
+    p, k, points = filter_.axes.p, filter_.axes.point, filter_.observer.points
     own, n = covariance_of_all(filter_), len(points)
     G = np.vstack([np.eye(p), filter_.axes.output_matrix(points).reshape(-1, p)])
     R = known.covariance_on(filter_.axes)
@@ -264,11 +264,11 @@ def test_a_map_is_entered_as_by_a_kalman_filter_of_all_errors_together(settings,
     kept = np.append(np.arange(len(own)), np.arange(len(own) + 4 * k, len(P)))
     filter_.enter_map(rows, known)
     assert_allclose(covariance_of_all(filter_), P[np.ix_(kept, kept)], atol=1e-6)
-    assert_allclose(filter_.points[rows], known.points[:4], atol=1e-5)
-    assert_allclose(filter_.points[n:], known.points[4:], atol=1e-5)
+    assert_allclose(filter_.observer.points[rows], known.points[:4], atol=1e-5)
+    assert_allclose(filter_.observer.points[n:], known.points[4:], atol=1e-5)
 
 
-class Compressed(RiccatiFilter):
+class Compressed(RiccatiGains):
     """A filter whose map is soon taken for a large one."""
 
     block = BlockSize(dense=5, most=6, kept=3, kept_per_seen=1)
@@ -279,7 +279,7 @@ class Compressed(RiccatiFilter):
 def test_independent_errors_are_correlated_ones_without_correlation(settings, rng):
     filters = [
         mapped(np.random.default_rng(1), settings, design=design)
-        for design in (RiccatiFilter, RiccatiFilter, Compressed)
+        for design in (RiccatiGains, RiccatiGains, Compressed)
     ]
     rows = np.array([6, 1, 3, 4])
     known = known_by_a_map(rng, filters[0], rows, others=3)
@@ -288,7 +288,7 @@ def test_independent_errors_are_correlated_ones_without_correlation(settings, rn
     filters[0].enter_map(rows, replace(known, joint=None))
     for filter_ in filters[1:]:
         filter_.enter_map(rows, replace(known, joint=independent))
-        assert_allclose(filter_.points, filters[0].points, atol=1e-7)
+        assert_allclose(filter_.observer.points, filters[0].observer.points, atol=1e-7)
         assert_allclose(covariance_of_all(filter_), covariance_of_all(filters[0]), atol=1e-9)
     assert not filters[2].joint.is_dense
 
@@ -300,16 +300,16 @@ def test_a_large_map_is_started_in_and_entered_as_a_small_one(settings, rng):
     for rows in (np.array([], dtype=np.int64), np.array([6, 1, 3, 4])):
         pair = [
             mapped(np.random.default_rng(1), settings, design=design)
-            for design in (RiccatiFilter, Compressed)
+            for design in (RiccatiGains, Compressed)
         ]
         known = known_by_a_map(rng, pair[0], rows, others=9)
         for filter_ in pair:
             filter_.enter_map(rows, known) if len(rows) else filter_.add_known(known)
             seen = np.array([0, 5, 9])
             for _ in range(3):
-                observe(filter_, seen, filter_.expected_points(seen) + 0.01, noise)
+                observe(filter_, seen, filter_.observer.body_points(seen) + 0.01, noise)
         assert not pair[1].joint.is_dense
-        assert_allclose(pair[1].points, pair[0].points, atol=1e-7)
+        assert_allclose(pair[1].observer.points, pair[0].observer.points, atol=1e-7)
         assert_allclose(covariance_of_all(pair[1]), covariance_of_all(pair[0]), atol=1e-7)
 
 
@@ -434,11 +434,11 @@ class TestTags:
     @given(generators())
     def test_a_map_is_entered_as_by_a_kalman_filter_of_all_errors_together(self, two_d_mode, rng):
         settings = replace(PLAIN, use_tag_orientation=True, two_d_mode=two_d_mode)
-        filter_ = mapped(rng, settings, n=6, design=RiccatiFilter)
+        filter_ = mapped(rng, settings, n=6, design=RiccatiGains)
         see_tags(rng, filter_, np.array([0, 1, 3]))
         # Of 3 both know how it is turned, of 0 and 1 the estimate alone, of 5 the map alone.
         rows, known = np.array([3, 1, 5, 0]), known_by_a_tag_map(rng, filter_)
-        axes, points = filter_.axes, filter_.points
+        axes, points = filter_.axes, filter_.observer.points
         p, k, q, n = axes.p, axes.point, axes.turn, len(points)
         stride = k + q
         own = filter_.joint.of_positions(points)
@@ -468,13 +468,15 @@ class TestTags:
         # Where the filter has them: of landmark 5 and the last of the new ones it took the map's.
         at = p + stride * np.arange(n + 2)
         found_at = [np.arange(p), ranges(at, k), ranges(at[[0, 1, 3, 5, 7]] + k, q)]
-        found = filter_.joint.of_positions(filter_.points)
+        found = filter_.joint.of_positions(filter_.observer.points)
         expected_at, found_at = np.concatenate(expected_at), np.concatenate(found_at)
         assert_allclose(
             found[np.ix_(found_at, found_at)], P[np.ix_(expected_at, expected_at)], atol=1e-6
         )
-        assert_array_equal(filter_.orientations.are_known, [1, 1, 0, 1, 0, 1, 0, 1])
-        assert_allclose(filter_.orientations.B[[5, 7]], known.orientations[[2, 5]], atol=1e-5)
+        assert_array_equal(filter_.observer.orientations.are_known, [1, 1, 0, 1, 0, 1, 0, 1])
+        assert_allclose(
+            filter_.observer.orientations.B[[5, 7]], known.orientations[[2, 5]], atol=1e-5
+        )
 
 
 def ranges(starts, count):
@@ -496,7 +498,7 @@ def known_by_a_tag_map(rng, filter_):
     known = known_by_a_map(rng, filter_, np.array([3, 1, 5, 0]), others=2)
     joint = random_joint(rng, 9)
     R = np.zeros((6, 3, 3))
-    R[0], R[2], R[5] = filter_.orientations.B[3], np.eye(3), np.eye(3)
+    R[0], R[2], R[5] = filter_.observer.orientations.B[3], np.eye(3), np.eye(3)
     return replace(
         known,
         covariances=diagonal_blocks(joint[:18, :18], 3).copy(),

@@ -38,7 +38,7 @@ def fail(*_):
     raise np.linalg.LinAlgError('singular matrix')
 
 def break_filter(self, message):
-    broken = self._estimator._hypotheses.best.filter
+    broken = self._estimator._hypotheses.best.errors
     if message.data == 1:
         broken.observer.A[...] = np.nan
     else:

@@ -55,14 +55,14 @@ GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
 
 def scale_and_bias(estimator):
     """Estimated factors (6,) and biases (6,), as they are applied to a velocity."""
-    calibrated = estimator._state.filter.calibration.apply
+    calibrated = estimator._state.calibration.apply
     once, twice = calibrated(np.array([np.ones(6), 2.0 * np.ones(6)]))
     return twice - once, 2.0 * once - twice
 
 
 def deviations(estimator, count):
     """Standard deviations of the ``count`` estimated entries."""
-    return np.sqrt(estimator._state.filter.calibration_variances[:count])
+    return np.sqrt(estimator._state.gains.calibration_variances[:count])
 
 
 def with_gains(settings, gains):
@@ -104,13 +104,13 @@ def test_a_robot_whose_wheels_stand_does_not_turn_by_a_bias(gains):
     start_ns = estimator.stamp_ns
     estimator.add(VelocityEvent(start_ns + 1, np.zeros(6)))
     estimator.flush()
-    parked, variances = estimator.pose, estimator._state.filter.calibration_variances.copy()
+    parked, variances = estimator.pose, estimator._state.gains.calibration_variances.copy()
     for n in range(1, 1000):
         estimator.add(VelocityEvent(start_ns + n * 10**8, np.zeros(6)))
     estimator.flush()
     np.testing.assert_allclose(estimator.pose, parked, atol=1e-9)
     np.testing.assert_array_equal(estimator.body_velocity, 0.0)
-    np.testing.assert_array_equal(estimator._state.filter.calibration_variances, variances)
+    np.testing.assert_array_equal(estimator._state.gains.calibration_variances, variances)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -130,7 +130,7 @@ def test_a_delay_is_found_as_well_as_its_covariance_says(
     normalised_squared = []
     for seed in range(3):
         estimator = estimate(drive(settings, 60.0, seed, delay_ns=delay_ns), settings)
-        error_s = (estimator._state.filter.calibration.delay_ns - delay_ns) * 1e-9
+        error_s = (estimator._state.calibration.delay_ns - delay_ns) * 1e-9
         sigma_s = deviations(estimator, 1)[0]
         normalised_squared.append((error_s / sigma_s) ** 2)
         assert sigma_s < 0.03
@@ -199,7 +199,7 @@ def test_a_velocity_stamped_late_shows_as_a_negative_delay():
     for seed in range(4):
         world = drive(settings, 60.0, seed, delay_ns=-DELAY_NS)
         estimator = estimate(world, settings)
-        found_ns = estimator._state.filter.calibration.delay_ns
+        found_ns = estimator._state.calibration.delay_ns
         assert found_ns == pytest.approx(-DELAY_NS, rel=0.3)
         errors_m.append(configuration_error_m(estimator, world))
         errors_left_m.append(configuration_error_m(estimate(world, left_alone), world))
@@ -216,7 +216,7 @@ def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
     )
     for seed in range(4):
         estimator = estimate(drive(settings, 60.0, seed, delay_ns=-200_000_000), settings)
-        found_ns = estimator._state.filter.calibration.delay_ns
+        found_ns = estimator._state.calibration.delay_ns
         assert found_ns == pytest.approx(-200_000_000, rel=0.15)
 
 
@@ -303,8 +303,8 @@ def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
     )
     estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
     V = true_velocities(5, planar=False)
-    np.testing.assert_array_equal(estimator._state.filter.calibration.apply(V), V)
-    assert estimator._state.filter.calibration.delay_ns == 0
+    np.testing.assert_array_equal(estimator._state.calibration.apply(V), V)
+    assert estimator._state.calibration.delay_ns == 0
 
 
 def rms_error_and_moved(settings, worlds):

@@ -20,7 +20,7 @@ from random_runs import (
 from strategies import generators
 
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import SeenPoints
@@ -28,7 +28,7 @@ from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize, CHECK_INTERVAL
 from slam_observer_ros.observer.riccati.following_landmarks import REFERENCE_SHIFT_M
 from slam_observer_ros.observer.riccati.panel_matrix import PanelMatrix
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 
 VIEW_M = 6.0
 
@@ -47,14 +47,14 @@ def _many_panels(monkeypatch):
         monkeypatch.setattr(module, 'PANEL_ROWS', 12)
 
 
-class Compressed(RiccatiFilter):
-    """A filter whose map is soon taken for a large one."""
+class Compressed(RiccatiGains):
+    """Gains whose map is soon taken for a large one."""
 
     block = BlockSize(dense=5, most=6, kept=3, kept_per_seen=1)
 
 
-class SameReferences(RiccatiFilter):
-    """A dense filter that judges motions by the references of a compressed one."""
+class SameReferences(RiccatiGains):
+    """Dense gains that judge motions by the references of compressed ones."""
 
     block = BlockSize(dense=10**9)
 
@@ -62,10 +62,10 @@ class SameReferences(RiccatiFilter):
         super().__init__(settings, np.eye(4))
         self.compressed = compressed
 
-    def propagate(self, motion):
-        Filter.propagate(self, motion)
+    def advance(self, motion):
+        Gains.advance(self, motion)
         joint = self.compressed.joint
-        points = self.compressed.points if joint.is_dense else joint.references
+        points = self.compressed.observer.points if joint.is_dense else joint.references
         self.joint.propagate(motion, points, self.observer.u)
 
 
@@ -118,7 +118,6 @@ class World:
         for filter_ in filters:
             if len(known):
                 if self.are_tags:
-                    filter_.expected_points(rows)
                     residuals_of(filter_, rows, y, R[: len(known)])  # makes them active
                     filter_.correct_by_orientations(turns)
                 observe(filter_, rows, y, R[: len(known)])
@@ -154,22 +153,33 @@ class World:
 
 
 def assert_same(compressed, dense, tolerance=1e-9):
-    rows = np.arange(len(dense.points))
-    if dense.estimates_orientations:
-        B, sigmas = dense.orientations.B, dense.orientation_sigmas(rows)
-        np.testing.assert_allclose(compressed.orientation_matrices(rows), B, atol=tolerance)
-        np.testing.assert_allclose(compressed.orientation_sigmas(rows), sigmas, atol=tolerance)
+    rows = np.arange(len(dense.observer.points))
+    if dense.tags is not None:
+        B, sigmas = dense.observer.orientations.B, dense.errors.orientation_sigmas(rows)
+        np.testing.assert_allclose(compressed.errors.orientation_matrices(rows), B, atol=tolerance)
+        np.testing.assert_allclose(
+            compressed.errors.orientation_sigmas(rows), sigmas, atol=tolerance
+        )
         of_all = [
-            each.joint.of_landmarks(rows, dense.points, rows) for each in (compressed, dense)
+            each.joint.of_landmarks(rows, dense.observer.points, rows)
+            for each in (compressed, dense)
         ]
         np.testing.assert_allclose(*of_all, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(compressed.observer.A, dense.observer.A, rtol=0.0, atol=tolerance)
-    np.testing.assert_allclose(compressed.points, dense.points, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(
-        compressed.calibration.values, dense.calibration.values, rtol=0.0, atol=tolerance
+        compressed.observer.points, dense.observer.points, rtol=0.0, atol=tolerance
     )
     np.testing.assert_allclose(
-        compressed.landmark_covariances(), dense.landmark_covariances(), rtol=0.0, atol=tolerance
+        compressed.calibration.values,
+        dense.calibration.values,
+        rtol=0.0,
+        atol=tolerance,
+    )
+    np.testing.assert_allclose(
+        compressed.errors.landmark_covariances(),
+        dense.errors.landmark_covariances(),
+        rtol=0.0,
+        atol=tolerance,
     )
     np.testing.assert_allclose(
         covariance_of_all(compressed), covariance_of_all(dense), rtol=0.0, atol=tolerance
@@ -237,7 +247,7 @@ def test_known_maps_poses_that_are_set_and_known_landmarks_that_anchor(settings,
     assert_same(*filters)
     world.drive(filters, 20)
     rows = np.arange(0, 15, 3)
-    r = filters[0].points[rows] - known[rows]
+    r = filters[0].observer.points[rows] - known[rows]
     for filter_ in filters:
         filter_.anchor(rows, r, covariances[rows])
     assert_same(*filters)
@@ -252,7 +262,7 @@ def test_references_follow_estimates_that_are_corrected_by_more_than_a_tolerance
         compressed = filters[0]
         if compressed.joint.is_dense:
             continue
-        off_m = np.linalg.norm(compressed.joint.references - compressed.points, axis=1)
+        off_m = np.linalg.norm(compressed.joint.references - compressed.observer.points, axis=1)
         moved = np.max(off_m, initial=0.0) > REFERENCE_SHIFT_M
         since = since + 1 if moved else 0
         assert since <= CHECK_INTERVAL

@@ -12,11 +12,10 @@ from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
 from slam_observer_ros.observer.constant import (
     centroid_step,
-    ConstantFilter,
+    ConstantGains,
     paper_step,
     safe_step,
 )
-from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.innovation import innovation, lyapunov, lyapunov_rate
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
@@ -41,7 +40,7 @@ def paper_observation(time_s):
 
 def biased_filter(reference_pose=None, bias_m=0.5):
     """Constant gains whose reference landmarks carry a bias, as in section VI."""
-    biased = ConstantFilter(Settings(), np.eye(4) if reference_pose is None else reference_pose)
+    biased = ConstantGains(Settings(), np.eye(4) if reference_pose is None else reference_pose)
     directions = np.random.default_rng(3).normal(size=(4, 3))
     biases = bias_m * directions / np.linalg.norm(directions, axis=1)[:, None]
     biased.add(SeenPoints(paper_observation(0.0) + biases, NO_NOISE))
@@ -52,7 +51,7 @@ def observe(filter_, rows, points, dt_s):
     """Correct a filter by landmarks that were seen ``dt_s`` before."""
     m = len(rows)
     dt_s = np.broadcast_to(dt_s, m)
-    filter_.correct(filter_.residuals(rows, SeenPoints(points, np.zeros((m, 3, 3))), dt_s))
+    filter_.observe(filter_.residuals(rows, SeenPoints(points, np.zeros((m, 3, 3))), dt_s))
 
 
 def integrate_paper_ode(sign_of_landmarks, sign_of_pose, duration_s, dt_s=1e-3):
@@ -89,7 +88,7 @@ def test_errors_are_rho_of_the_inverse_state_29():
 
 @given(poses(), generators())
 def test_estimate_is_phi_of_state_and_reference_23(reference_pose, rng):
-    estimated = Filter(Settings(), reference_pose)
+    estimated = ConstantGains(Settings(), reference_pose)
     observer = estimated.observer
     observer.add_reference_landmarks(rng.normal(size=(4, 3)))
     observer.A[...] = se3.exp(rng.normal(size=6))
@@ -97,21 +96,21 @@ def test_estimate_is_phi_of_state_and_reference_23(reference_pose, rng):
     reference = TotalState(reference_pose, se3.transform(reference_pose, observer.y_ref))
     estimate = slam_group.phi_total(SlamElement(observer.A, observer.a), reference)
     np.testing.assert_allclose(observer.pose, estimate.P, atol=1e-9)
-    np.testing.assert_allclose(estimated.world_points, estimate.p, atol=1e-9)
+    np.testing.assert_allclose(estimated.observer.world_points, estimate.p, atol=1e-9)
 
 
 @given(poses(), generators())
 def test_residual_vanishes_exactly_where_the_output_fits_for_any_reference_pose(
     reference_pose, rng
 ):
-    estimated = Filter(Settings(), reference_pose)
+    estimated = ConstantGains(Settings(), reference_pose)
     observer = estimated.observer
     observer.A[...] = se3.exp(rng.normal(size=6))
     points = rng.normal(size=(3, 3))
     observer.add_landmarks(points)
     observer.propagate(se3.path(observer.A, 0.4 * rng.normal(size=(2, 6))))
-    predicted = se3.transform(se3.inverse(observer.pose), estimated.world_points)
-    np.testing.assert_allclose(estimated.expected_points(np.arange(3)), predicted, atol=1e-10)
+    predicted = se3.transform(se3.inverse(observer.pose), estimated.observer.world_points)
+    np.testing.assert_allclose(estimated.observer.body_points(np.arange(3)), predicted, atol=1e-10)
     _, r = observer.errors(slice(None), predicted)
     np.testing.assert_allclose(r, 0.0, atol=1e-10)
 
@@ -169,7 +168,7 @@ def test_any_reference_pose_gives_the_same_configuration(reference_pose):
         for step in range(40):
             observe(biased, np.arange(4), paper_observation(0.1 * step), 0.1)
             observer.propagate(se3.path(observer.A, 0.1 * PAPER_VELOCITY[None]))
-        return se3.transform(se3.inverse(observer.pose), biased.world_points)
+        return se3.transform(se3.inverse(observer.pose), biased.observer.world_points)
 
     np.testing.assert_allclose(final_output(reference_pose), final_output(np.eye(4)), atol=1e-8)
 
@@ -191,7 +190,7 @@ def test_lyapunov_never_increases_at_any_step_gain_distance_and_rotation(
     y_ref = distance_m * rng.normal(size=(n, 3))
     points = y_ref @ turn.T + 0.3 * distance_m * rng.normal(size=(n, 3))
     settings = Settings(gain_k=k, gain_l=k * rng.uniform(0.01, 10.0), step_mode=step_mode)
-    constant = ConstantFilter(settings, np.eye(4))
+    constant = ConstantGains(settings, np.eye(4))
     constant.add_known(KnownLandmarks(y_ref, np.zeros((n, 3, 3))))
     observe(constant, np.arange(n), points, dt_s)
     _, remaining = constant.observer.errors(slice(None), points)
@@ -215,7 +214,7 @@ def test_paper_step_converges_to_the_paper_ode_with_first_order():
 @given(generators(), st.integers(1, 6))
 def test_the_paper_step_mode_moves_the_state_by_the_innovation_30_31(rng, n):
     settings = Settings(gain_k=2.0, gain_l=3.0, step_mode='paper')
-    constant, dt_s = ConstantFilter(settings, np.eye(4)), 1e-7
+    constant, dt_s = ConstantGains(settings, np.eye(4)), 1e-7
     observer = constant.observer
     observer.add_reference_landmarks(rng.normal(size=(n, 3)))
     observer.A[...], observer.a[...] = se3.exp(rng.normal(size=6)), rng.normal(size=(n, 3))
@@ -241,7 +240,7 @@ def test_far_landmarks_that_overflow_the_explicit_step_converge():
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(100, 3))
     y_ref = 50.0 * directions / np.linalg.norm(directions, axis=1)[:, None]
-    constant, levels = ConstantFilter(Settings(), np.eye(4)), []
+    constant, levels = ConstantGains(Settings(), np.eye(4)), []
     known = y_ref + 0.5 * rng.normal(size=y_ref.shape)
     constant.add_known(KnownLandmarks(known, np.zeros((100, 3, 3))))
     for _ in range(500):
@@ -254,7 +253,7 @@ def test_far_landmarks_that_overflow_the_explicit_step_converge():
 def test_unseen_landmarks_stay_where_they_are_in_the_world():
     biased = biased_filter()
     biased.observer.a[...] = 0.1 * np.ones((4, 3))
-    before = biased.world_points
+    before = biased.observer.world_points
     observe(biased, np.array([0, 1]), paper_observation(0.0)[:2], 0.1)
-    np.testing.assert_array_equal(biased.world_points[2:], before[2:])
-    assert (biased.world_points[:2] != before[:2]).any()
+    np.testing.assert_array_equal(biased.observer.world_points[2:], before[2:])
+    assert (biased.observer.world_points[:2] != before[:2]).any()

@@ -24,10 +24,11 @@ from strategies import generators, poses
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati import riccati as riccati_module
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
 
@@ -36,7 +37,7 @@ CALIBRATED = replace(PLAIN, angular_bias_stddev=(0.02,) * 3, linear_scale_stddev
 
 def started(rng, settings=PLAIN, n=4):
     """A filter that has seen n landmarks, then moved and seen some of them again."""
-    riccati = RiccatiFilter(settings, np.eye(4))
+    riccati = RiccatiGains(settings, np.eye(4))
     riccati.add(
         SeenPoints(rng.normal(scale=4.0, size=(n, 3)), 0.01 * random_covariances(rng, n, 3))
     )
@@ -65,7 +66,7 @@ def constant_output_matrix(n):
 
 def output_matrix_of(riccati, rows):
     """The H by which a filter corrects for landmarks at ``rows``: H P where P is I."""
-    residuals = residuals_of(riccati, rows, riccati.expected_points(rows), np.eye(3))
+    residuals = residuals_of(riccati, rows, riccati.observer.body_points(rows), np.eye(3))
     riccati.joint.P = np.eye(len(riccati.joint.P))
     return riccati.joint.project(riccati.joint.output_matrix(residuals), rows)[0]
 
@@ -116,7 +117,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     pieces, dt_s = 20, 0.01
     V = rng.normal(size=(pieces, 6))
     Q = random_covariances(rng, pieces, 6)
-    riccati = RiccatiFilter(PLAIN, np.eye(4))
+    riccati = RiccatiGains(PLAIN, np.eye(4))
     riccati.observer.A[...] = start = se3.exp(rng.normal(size=6))
     propagate(riccati, V, np.full(pieces, dt_s), Q)
 
@@ -133,7 +134,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
         F = np.array([error(piece, 1e-6 * w) / 1e-6 for w in np.eye(6)]).T
         expected += F @ Q[piece] @ F.T
     # A rate's noise is taken to act at the piece's beginning, not throughout: hence 2 %.
-    difference = np.linalg.norm(riccati.pose_covariance() - expected)
+    difference = np.linalg.norm(riccati.errors.pose_covariance() - expected)
     assert difference < 0.02 * np.linalg.norm(expected)
 
 
@@ -146,14 +147,14 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
     def predicted(point, velocity):
         """The covariances of the residual after two blind motions of a second each."""
         settings = replace(PLAIN, two_d_mode=two_d_mode, landmark_velocity_stddev=1e-9)
-        riccati = RiccatiFilter(settings, np.eye(4))
+        riccati = RiccatiGains(settings, np.eye(4))
         riccati.add(SeenPoints(point, np.zeros((1, 3, 3))))
         riccati.observer.set_landmark_velocities(np.array([0]), velocity)
         propagate(riccati, V, dt_s, Q)
         propagate(riccati, V, dt_s, Q)
         rows = np.array([0])
-        points = riccati.expected_points(rows)
-        return riccati.predicted(residuals_of(riccati, rows, points, np.zeros((1, 3, 3))))
+        points = riccati.observer.body_points(rows)
+        return riccati.errors.predicted(residuals_of(riccati, rows, points, np.zeros((1, 3, 3))))
 
     with_pose, own = predicted(start, velocity)
     with_pose_at_rest, own_at_rest = predicted(start + 2.0 * velocity, np.zeros((1, 3)))
@@ -165,7 +166,7 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
 def test_an_observation_needs_no_more_memory_than_a_few_times_that_of_the_covariance(landmarks):
     """With the motion that leads to it: no other matrix is as large for more than a moment."""
     rng, rows = np.random.default_rng(0), np.arange(10)
-    riccati = RiccatiFilter(PLAIN, np.eye(4))
+    riccati = RiccatiGains(PLAIN, np.eye(4))
     points = rng.normal(size=(landmarks, 3))
     riccati.add(SeenPoints(points, random_covariances(rng, landmarks, 3)))
     V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
@@ -189,7 +190,7 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     Q[axes.pose, axes.pose] = 1e-4 * np.eye(axes.p)
     R = np.diag([1e-3, 2e-3, 3e-3])
     point = np.array([[2.0, -1.0, 0.0 if two_d_mode else 0.5]])
-    riccati = RiccatiFilter(replace(PLAIN, two_d_mode=two_d_mode), np.eye(4))
+    riccati = RiccatiGains(replace(PLAIN, two_d_mode=two_d_mode), np.eye(4))
     riccati.add(SeenPoints(point, R[None]))
     propagate(riccati, V, np.full(pieces, 0.1), np.tile(Q, (pieces, 1, 1)))
     seen = se3.transform(se3.inverse(riccati.observer.A), point)
@@ -203,7 +204,7 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     sampled = np.cov(residuals[:, :k].T)
     residuals = residuals_of(riccati, np.array([0]), seen, R[None])
     if two_d_mode:
-        predicted = riccati.predicted(residuals)[1] + residuals.covariances[0, :2, :2]
+        predicted = riccati.errors.predicted(residuals)[1] + residuals.covariances[0, :2, :2]
     else:
         predicted = predicted_covariance(riccati, residuals)
     whitening = np.linalg.inv(np.linalg.cholesky(predicted))
@@ -217,7 +218,7 @@ def test_observations_never_determine_where_the_worlds_frame_is(rng):
 
     def run(frame_covariance):
         random = np.random.default_rng(seed)
-        riccati = RiccatiFilter(PLAIN, np.eye(4))
+        riccati = RiccatiGains(PLAIN, np.eye(4))
         riccati.set_pose(np.eye(4), frame_covariance)
         points = random.normal(scale=4.0, size=(4, 3))
         riccati.add(SeenPoints(points, 0.01 * random_covariances(random, 4, 3)))
@@ -228,7 +229,7 @@ def test_observations_never_determine_where_the_worlds_frame_is(rng):
     sure, unsure = run(np.zeros((6, 6))), run(unsure_of_frame)
     np.testing.assert_allclose(unsure.observer.A, sure.observer.A, atol=1e-9)
     np.testing.assert_allclose(unsure.observer.a, sure.observer.a, atol=1e-8)
-    gauge = np.vstack([np.eye(6), SPATIAL.output_matrix(sure.points).reshape(-1, 6)])
+    gauge = np.vstack([np.eye(6), SPATIAL.output_matrix(sure.observer.points).reshape(-1, 6)])
     expected = covariance_of_all(sure) + gauge @ unsure_of_frame @ gauge.T
     np.testing.assert_allclose(covariance_of_all(unsure), expected, rtol=1e-9, atol=1e-9)
 
@@ -238,7 +239,7 @@ def test_covariance_stays_symmetric_and_positive_over_many_steps_of_any_noise(
     point_variance_exponents,
 ):
     rng = np.random.default_rng(4)
-    riccati = RiccatiFilter(PLAIN, np.eye(4))
+    riccati = RiccatiGains(PLAIN, np.eye(4))
     riccati.add(
         SeenPoints(rng.normal(scale=4.0, size=(3, 3)), np.tile(1e-2 * np.eye(3), (3, 1, 1)))
     )
@@ -249,7 +250,7 @@ def test_covariance_stays_symmetric_and_positive_over_many_steps_of_any_noise(
     for step in range(steps):
         propagate(riccati, V[step], dt_s, Q[step])
         seen = np.array([step // 7 % 3])
-        points = riccati.expected_points(seen) + np.sqrt(R[step, :, 0, 0]) * rng.normal(
+        points = riccati.observer.body_points(seen) + np.sqrt(R[step, :, 0, 0]) * rng.normal(
             size=(1, 3)
         )
         observe(riccati, seen, points, R[step])
@@ -276,11 +277,11 @@ def test_an_observation_never_adds_uncertainty(rng):
 def test_removing_landmarks_leaves_the_marginal_of_the_others(rng, removed):
     riccati = started(rng)
     kept = np.setdiff1d(np.arange(4), removed)
-    pose, others = riccati.pose_covariance(), riccati.joint_covariance(kept)
-    points = riccati.points[kept]
+    pose, others = riccati.errors.pose_covariance(), riccati.joint_covariance(kept)
+    points = riccati.observer.points[kept]
     riccati.remove(np.array(removed))
-    np.testing.assert_array_equal(riccati.pose_covariance(), pose)
-    np.testing.assert_array_equal(riccati.points, points)
+    np.testing.assert_array_equal(riccati.errors.pose_covariance(), pose)
+    np.testing.assert_array_equal(riccati.observer.points, points)
     np.testing.assert_array_equal(covariance_of_all(riccati), others)
 
 
@@ -296,12 +297,14 @@ def test_a_landmark_that_is_relocated_is_as_new_and_the_others_stay(rng):
     np.testing.assert_allclose(
         covariance_of_all(relocated), added.joint_covariance(order), atol=1e-12
     )
-    np.testing.assert_array_equal(relocated.pose_covariance(), added.pose_covariance())
+    np.testing.assert_array_equal(
+        relocated.errors.pose_covariance(), added.errors.pose_covariance()
+    )
 
 
 def test_in_an_exact_map_nothing_is_known_of_pose_and_landmarks_together():
-    riccati = RiccatiFilter(PLAIN, np.eye(4))
-    riccati.fix_landmarks(np.eye(3), np.tile(0.01 * np.eye(3), (3, 1, 1)))
+    riccati = RiccatiGains(PLAIN, np.eye(4))
+    riccati.fix_landmarks(KnownLandmarks(np.eye(3), np.tile(0.01 * np.eye(3), (3, 1, 1))))
     assert riccati.joint_covariance(np.arange(3)) is None
 
 
@@ -362,7 +365,7 @@ def test_pose_covariance_is_that_of_rotation_and_position_in_the_world(initial_p
     settings = Settings(relinearization_interval=0, velocity_delay_stddev=0.0)
     world = drive(settings, 2.0, seed=int(rng.integers(1000)))
     estimator = estimate(world, settings, initial_pose=initial_pose)
-    pose, filter_ = estimator.pose, estimator._state.filter
+    pose, filter_ = estimator.pose, estimator._state.gains
 
     def shift(x):
         moved = initial_pose @ se3.exp(x) @ filter_.observer.A
@@ -371,7 +374,7 @@ def test_pose_covariance_is_that_of_rotation_and_position_in_the_world(initial_p
 
     h = 1e-6
     F = np.array([(shift(h * x) - shift(-h * x)) / (2 * h) for x in np.eye(6)]).T
-    expected = F @ filter_.pose_covariance() @ F.T
+    expected = F @ filter_.errors.pose_covariance() @ F.T
     np.testing.assert_allclose(estimator.pose_covariance, expected, rtol=1e-6, atol=1e-9)
 
 
@@ -390,7 +393,7 @@ def test_the_order_of_landmarks_in_a_message_does_not_matter():
 
 
 def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees():
-    riccati = RiccatiFilter(PLAIN, np.eye(4))
+    riccati = RiccatiGains(PLAIN, np.eye(4))
     riccati.add(
         SeenPoints(
             np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1))
@@ -462,12 +465,12 @@ def test_what_relinearising_failed_for_is_relinearised_later(monkeypatch):
 @given(generators())
 def test_many_points_in_blocks_leave_what_all_at_once_would(settings, is_exact, rng):
     filters = [started(np.random.default_rng(0), settings, n=12) for _ in range(2)]
-    points = filters[0].points + 0.1 * rng.standard_normal((12, 3))
+    points = filters[0].observer.points + 0.1 * rng.standard_normal((12, 3))
     if is_exact:
         for each in filters:
-            each.fix_landmarks(points, np.zeros((12, 3, 3)))
+            each.fix_landmarks(KnownLandmarks(points, np.zeros((12, 3, 3))))
     rows = rng.permutation(12)
-    seen = filters[0].expected_points(rows) + 0.1 * rng.standard_normal((12, 3))
+    seen = filters[0].observer.body_points(rows) + 0.1 * rng.standard_normal((12, 3))
     R, all_at_once = 0.01 * random_covariances(rng, 12, 3), riccati_module.AT_ONCE
     for each, at_once in zip(filters, (all_at_once, 5), strict=True):
         with pytest.MonkeyPatch.context() as patch:
@@ -475,7 +478,7 @@ def test_many_points_in_blocks_leave_what_all_at_once_would(settings, is_exact, 
             observe(each, rows, seen, R)
     one, other = filters
     np.testing.assert_allclose(other.observer.A, one.observer.A, rtol=0.0, atol=3e-14)
-    np.testing.assert_allclose(other.points, one.points, rtol=0.0, atol=3e-14)
+    np.testing.assert_allclose(other.observer.points, one.observer.points, rtol=0.0, atol=3e-14)
     np.testing.assert_allclose(other.calibration.values, one.calibration.values, atol=3e-14)
     P = one.joint.P
     np.testing.assert_allclose(other.joint.P, P, rtol=0.0, atol=3e-14 * np.abs(P).max())
@@ -488,7 +491,7 @@ def test_an_outlier_in_a_later_block_is_judged_by_those_before_it(rng):
     riccati = started(np.random.default_rng(0), settings, n=12)
     riccati.set_pose(riccati.observer.A, np.eye(6))
     rows = np.arange(12)
-    seen = riccati.expected_points(rows) + 0.01 * rng.standard_normal((12, 3))
+    seen = riccati.observer.body_points(rows) + 0.01 * rng.standard_normal((12, 3))
     seen[11] += 1.5
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(riccati_module, 'AT_ONCE', 6)

@@ -10,7 +10,7 @@ from strategies import generators
 
 from slam_observer_ros.geometry.so3 import hat
 from slam_observer_ros.observer.residuals import SeenPoints
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 
 
 class RightInvariantEkf:
@@ -75,7 +75,7 @@ class RightInvariantEkf:
 
 def assert_same(riccati, ekf):
     np.testing.assert_allclose(riccati.observer.A, ekf.chi[:4, :4], rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(riccati.points, ekf.points, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(riccati.observer.points, ekf.points, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(riccati.joint.P, ekf.P, rtol=0.0, atol=1e-9)
     to_positions = np.eye(len(ekf.P))  # ã_i = ξ_i − [p̂_i]× ε_Ω
     to_positions[6:, :3] = -hat(ekf.points).reshape(-1, 3)
@@ -86,7 +86,7 @@ def assert_same(riccati, ekf):
 @given(generators())
 def test_riccati_filter_is_the_right_invariant_ekf(rng):
     """Over random motions, observations, new landmarks and ones that are placed again."""
-    riccati, ekf = RiccatiFilter(PLAIN, np.eye(4)), RightInvariantEkf()
+    riccati, ekf = RiccatiGains(PLAIN, np.eye(4)), RightInvariantEkf()
     for number in range(30):
         V, dt_s = rng.normal(size=(2, 6)), rng.uniform(0.05, 0.2, 2)
         Q = 1e-3 * random_covariances(rng, 2, 6)
@@ -96,10 +96,10 @@ def test_riccati_filter_is_the_right_invariant_ekf(rng):
             y, R = rng.normal(scale=4.0, size=(2, 3)), 1e-2 * random_covariances(rng, 2, 3)
             riccati.add(SeenPoints(y, R))
             ekf.add(y, R)
-        n = len(riccati.points)
+        n = len(riccati.observer.points)
         rows = np.sort(rng.permutation(n)[: rng.integers(1, n + 1)])
         R = 1e-2 * random_covariances(rng, len(rows), 3)
-        y = riccati.expected_points(rows) + 0.1 * rng.normal(size=(len(rows), 3))
+        y = riccati.observer.body_points(rows) + 0.1 * rng.normal(size=(len(rows), 3))
         observe(riccati, rows, y, R)
         ekf.correct(rows, y, R)
         if number % 7 == 6:

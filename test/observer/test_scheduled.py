@@ -30,7 +30,7 @@ from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.scheduled.core import CAPACITY
 from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
-from slam_observer_ros.observer.scheduled.scheduled import ScheduledFilter
+from slam_observer_ros.observer.scheduled.scheduled import ScheduledGains
 from slam_observer_ros.runs.simulated_run import run_simulation
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
@@ -93,7 +93,7 @@ def test_reading_the_map_changes_no_bit_of_it():
 
 def landmarks_about_a_robot(rng, n):
     """Filter that has seen n landmarks twice, on a motion that left it unsure of its pose."""
-    scheduled = ScheduledFilter(PLAIN, np.eye(4))
+    scheduled = ScheduledGains(PLAIN, np.eye(4))
     scheduled.set_pose(np.eye(4), 1e-4 * random_covariances(rng, 1, 6)[0])
     scheduled.add(
         SeenPoints(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
@@ -106,7 +106,7 @@ def landmarks_about_a_robot(rng, n):
 
 
 def bring_up_to_date(scheduled):
-    scheduled.expected_points(np.arange(len(scheduled.points)))
+    scheduled.prepare(np.arange(len(scheduled.observer)))
 
 
 def of_pose_and_each_landmark(n):
@@ -122,9 +122,13 @@ def test_an_observation_acts_on_all_landmarks_as_in_a_kalman_filter(rng, n):
     scheduled = landmarks_about_a_robot(rng, n)
     seen = np.sort(rng.permutation(n)[: rng.integers(1, n)])
     bring_up_to_date(scheduled)
-    prior, points, A = covariance_of_all(scheduled), scheduled.points, scheduled.observer.A.copy()
+    prior, points, A = (
+        covariance_of_all(scheduled),
+        scheduled.observer.points,
+        scheduled.observer.A.copy(),
+    )
     R = 1e-3 * random_covariances(rng, len(seen), 3)
-    residuals = residuals_of(scheduled, seen, scheduled.expected_points(seen) + 0.03, R)
+    residuals = residuals_of(scheduled, seen, scheduled.observer.body_points(seen) + 0.03, R)
     C = np.zeros((3 * len(seen), len(prior)))
     C[:, :6] = SPATIAL.output_matrix(points[seen]).reshape(-1, 6)
     C[np.arange(len(C)), (6 + 3 * seen[:, None] + np.arange(3)).ravel()] = -1.0
@@ -136,11 +140,11 @@ def test_an_observation_acts_on_all_landmarks_as_in_a_kalman_filter(rng, n):
     turn[6:, :6] = SPATIAL.turn_matrix(x[6:].reshape(n, 3)).reshape(-1, 6)
     posterior = turn @ (prior - K @ C @ prior) @ turn.T
 
-    weights = scheduled.correct(residuals)
+    weights = scheduled.observe(residuals)
     np.testing.assert_array_equal(weights, 1.0)
     D = scheduled.observer.A @ se3.inverse(A)
     np.testing.assert_allclose(D, se3.exp(x[:6]), atol=1e-8)
-    np.testing.assert_allclose(scheduled.points, points + x[6:].reshape(n, 3), atol=1e-8)
+    np.testing.assert_allclose(scheduled.observer.points, points + x[6:].reshape(n, 3), atol=1e-8)
     tolerance = 1e-7 * np.abs(prior).max()
     own = of_pose_and_each_landmark(n)
     found = covariance_of_all(scheduled)
@@ -207,7 +211,7 @@ def test_landmarks_wait_in_few_groups():
 @pytest.mark.parametrize('point_variance_exponents', [(-8.0, 2.0), (-8.0, -8.0), (2.0, 2.0)])
 def test_covariances_stay_positive_over_many_steps_of_any_noise(point_variance_exponents):
     rng, n = np.random.default_rng(4), 20
-    scheduled = ScheduledFilter(PLAIN, np.eye(4))
+    scheduled = ScheduledGains(PLAIN, np.eye(4))
     scheduled.add(
         SeenPoints(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
     )
@@ -219,7 +223,7 @@ def test_covariances_stay_positive_over_many_steps_of_any_noise(point_variance_e
         propagate(scheduled, V[step], dt_s, Q[step])
         seen = np.array([step // 7 % n])
         off = np.sqrt(R[step, :, 0, 0]) * rng.normal(size=(1, 3))
-        observe(scheduled, seen, scheduled.expected_points(seen) + off, R[step])
+        observe(scheduled, seen, scheduled.observer.body_points(seen) + off, R[step])
         if step % 200 == 0:
             P = covariance_of_all(scheduled)
             deviations = np.sqrt(np.diag(P))
@@ -231,9 +235,9 @@ def test_removed_landmarks_leave_the_others_as_they_were():
     scheduled = landmarks_about_a_robot(rng, n)
     bring_up_to_date(scheduled)
     removed, kept = np.array([0, 3, 12]), np.setdiff1d(np.arange(n), [0, 3, 12])
-    before, points = scheduled.joint_covariance(kept), scheduled.points[kept]
+    before, points = scheduled.joint_covariance(kept), scheduled.observer.points[kept]
     scheduled.remove(removed)
-    np.testing.assert_allclose(scheduled.points, points, atol=1e-12)
+    np.testing.assert_allclose(scheduled.observer.points, points, atol=1e-12)
     own, after = of_pose_and_each_landmark(len(kept)), covariance_of_all(scheduled)
     np.testing.assert_allclose(after[own], before[own], atol=1e-6 * before.max())
     for _ in range(5):
@@ -250,11 +254,11 @@ def test_after_landmarks_of_the_core_were_removed_what_says_nothing_changes_noth
     removed = np.sort(last_seen[last_seen >= 0][:3])
     scheduled.remove(removed)
     n -= 3
-    before, points = covariance_of_all(scheduled), scheduled.points
+    before, points = covariance_of_all(scheduled), scheduled.observer.points
     for row in range(n):
         seen = np.array([row])
-        observe(scheduled, seen, scheduled.expected_points(seen), 1e9 * np.eye(3)[None])
-    np.testing.assert_allclose(scheduled.points, points, atol=1e-9)
+        observe(scheduled, seen, scheduled.observer.body_points(seen), 1e9 * np.eye(3)[None])
+    np.testing.assert_allclose(scheduled.observer.points, points, atol=1e-9)
     own, after = of_pose_and_each_landmark(n), covariance_of_all(scheduled)
     np.testing.assert_allclose(after[own], before[own], atol=1e-6 * before.max())
 
@@ -265,7 +269,7 @@ def test_a_landmark_that_is_relocated_is_as_uncertain_as_a_new_one():
     point, R = rng.normal(size=(1, 3)), random_covariances(rng, 1, 3)
     relocated.relocate(np.array([1]), SeenPoints(point, R))
     added.add(SeenPoints(point, R))
-    np.testing.assert_allclose(relocated.points[1], added.points[n], atol=1e-12)
+    np.testing.assert_allclose(relocated.observer.points[1], added.observer.points[n], atol=1e-12)
     of_one = np.append(np.arange(6), np.arange(9, 12))
     of_last = np.append(np.arange(6), 6 + 3 * n + np.arange(3))
     np.testing.assert_allclose(

@@ -18,7 +18,7 @@ from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.runs.health import of_mounting
 from slam_observer_ros.sensor_models import sensing, sensor_calibration
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -97,11 +97,11 @@ def test_derivatives_of_residuals_are_those_of_differences(settings):
     estimator = estimate(drive(settings, 5.0), replace(settings, relinearization_interval=0))
     state, event = estimator._state, drive(settings, 6.0, noise=0.0).observations()[-1]
     state.set_pose(drive(settings, 6.0).poses[-1], None)
-    calibration, h = state.filter.calibration, 1e-6
+    calibration, h = state.calibration, 1e-6
 
     def residuals(change):
         state_off = state.copy()
-        state_off.filter.calibration.shift(change)
+        state_off.calibration.shift(change)
         return match(state_off, event).residuals
 
     # At the points that are predicted, which those seen are near.
@@ -265,9 +265,9 @@ def test_in_a_large_map_it_is_found_as_in_a_small_one(settings, monkeypatch):
     settings = replace(settings, relinearization_interval=0)
     world = erring(drive(settings, 30.0, landmarks=30), settings)
     dense = estimate(world, settings)
-    monkeypatch.setattr(RiccatiFilter, 'block', BlockSize(dense=10, most=10, kept=4))
+    monkeypatch.setattr(RiccatiGains, 'block', BlockSize(dense=10, most=10, kept=4))
     compressed = estimate(world, settings)
-    assert not compressed._state.filter.joint.is_dense
+    assert not compressed._state.errors.joint.is_dense
     for before, after in zip(dense.calibration, compressed.calibration, strict=True):
         assert abs(after.value - before.value) < 0.05 * before.deviation
         assert after.deviation == pytest.approx(before.deviation, rel=0.01)

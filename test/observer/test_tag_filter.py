@@ -13,7 +13,7 @@ from strategies import generators
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import SeenPoints
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.state.tag_orientations import flipped
 
 TAGS = replace(PLAIN, use_tag_orientation=True)
@@ -22,7 +22,7 @@ PLANAR_TAGS = replace(TAGS, two_d_mode=True)
 
 def tag_filter(rng, n=3, settings=TAGS):
     """A filter with n tags, which then has moved."""
-    tags = RiccatiFilter(settings, np.eye(4))
+    tags = RiccatiGains(settings, np.eye(4))
     points = rng.normal(scale=4.0, size=(n, 3)) * [1.0, 1.0, not settings.two_d_mode]
     tags.add(SeenPoints(points, 0.01 * random_covariances(rng, n, 3)))
     tags.add_orientations(seen(np.arange(n), so3.exp(rng.normal(size=(n, 3))), 0.05))
@@ -44,7 +44,7 @@ def seen(rows, Z, sigma_rad):
 
 
 def predicted_orientations(tags, rows):
-    return tags.observer.A[:3, :3].T @ tags.orientations.B[rows]
+    return tags.observer.A[:3, :3].T @ tags.observer.orientations.B[rows]
 
 
 @pytest.mark.parametrize('settings', [TAGS, PLANAR_TAGS])
@@ -75,14 +75,14 @@ def test_orientations_that_are_never_seen_leave_the_filter_of_points(rng):
         for _ in range(5):
             move(filter_, random)
             rows = np.sort(random.permutation(4)[:2])
-            points = filter_.expected_points(rows) + 0.1 * random.normal(size=(2, 3))
+            points = filter_.observer.body_points(rows) + 0.1 * random.normal(size=(2, 3))
             observe(filter_, rows, points, random_covariances(random, 2, 3))
         return filter_
 
-    points, tags = run(RiccatiFilter(PLAIN, np.eye(4))), run(RiccatiFilter(TAGS, np.eye(4)))
+    points, tags = run(RiccatiGains(PLAIN, np.eye(4))), run(RiccatiGains(TAGS, np.eye(4)))
     rows = np.arange(4)
     np.testing.assert_allclose(tags.observer.A, points.observer.A, atol=1e-12)
-    np.testing.assert_allclose(tags.points, points.points, atol=1e-11)
+    np.testing.assert_allclose(tags.observer.points, points.observer.points, atol=1e-11)
     np.testing.assert_allclose(
         tags.joint_covariance(rows), points.joint_covariance(rows), atol=1e-11
     )
@@ -102,7 +102,7 @@ def test_orientations_then_points_are_both_at_once(rng):
     noise[6:9, 6:9], noise[9:, 9:] = turned
     at_once = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + noise, H @ P)
     tags.correct_by_orientations(seen(rows, predicted_orientations(tags, rows), sigma_rad))
-    observe(tags, rows, tags.expected_points(rows), R)
+    observe(tags, rows, tags.observer.body_points(rows), R)
     np.testing.assert_allclose(tags.joint.P, at_once, atol=1e-10)
 
 
@@ -133,7 +133,7 @@ def test_no_orientation_tells_where_the_worlds_frame_is(rng):
 
 def test_one_tag_in_view_tells_the_heading_which_its_position_does_not():
     def heading_variance(with_orientation):
-        tags = RiccatiFilter(TAGS, np.eye(4))
+        tags = RiccatiGains(TAGS, np.eye(4))
         tags.add(SeenPoints(np.array([[3.0, 0.0, 0.0]]), 1e-4 * np.eye(3)[None]))
         tags.add_orientations(seen(np.array([0]), np.eye(3)[None], 0.02))
         Q = np.diag([0.1, 0.1, 0.1, 0.3, 0.3, 0.3])[None]
@@ -141,8 +141,8 @@ def test_one_tag_in_view_tells_the_heading_which_its_position_does_not():
         rows = np.array([0])
         if with_orientation:
             tags.correct_by_orientations(seen(rows, predicted_orientations(tags, rows), 0.02))
-        observe(tags, rows, tags.expected_points(rows), 1e-4 * np.eye(3)[None])
-        return tags.pose_covariance()[2, 2]
+        observe(tags, rows, tags.observer.body_points(rows), 1e-4 * np.eye(3)[None])
+        return tags.errors.pose_covariance()[2, 2]
 
     assert heading_variance(with_orientation=False) > 0.02
     assert heading_variance(with_orientation=True) < 2.1 * 0.02**2
@@ -162,7 +162,7 @@ def one_drive(settings, n, seed):
     rng = np.random.default_rng(seed)
     is_flat = settings.two_d_mode
     only = np.array([0, 0, 1, 1, 1, 0]) if is_flat else np.ones(6)
-    tags, A = RiccatiFilter(settings, np.eye(4)), np.eye(4)
+    tags, A = RiccatiGains(settings, np.eye(4)), np.eye(4)
     points = np.array([[2.0 * i, 1.0, 0.0] for i in range(n)])
     turns = np.zeros((n, 3)) if is_flat else rng.normal(size=(n, 3))
     B, Q, sigma_m, sigma_rad = so3.exp(turns), 1e-4 * np.diag(only), 0.03, 0.03
@@ -208,7 +208,7 @@ def test_a_flipped_tag_looks_the_same_from_afar_and_flips_back(rng):
 @pytest.mark.parametrize('sigma_rad', [0.02, 0.3])
 def test_of_an_orientation_and_its_twin_the_likelier_one_is_used_and_none_if_both_are(sigma_rad):
     """With a heading known to 0.02 rad it is clear which of the two it is, to 0.3 rad it isn't."""
-    tags, rows = RiccatiFilter(TAGS, np.eye(4)), np.array([0])
+    tags, rows = RiccatiGains(TAGS, np.eye(4)), np.array([0])
     away, tilted = np.array([[4.0, 0.0, 0.0]]), so3.exp(np.array([[0.0, np.pi / 2 + 0.3, 0.0]]))
     tags.add(SeenPoints(away, 1e-4 * np.eye(3)[None]))
     tags.add_orientations(seen(rows, tilted, 0.02))
@@ -231,8 +231,8 @@ def test_of_an_orientation_and_its_twin_the_likelier_one_is_used_and_none_if_bot
 @given(generators())
 def test_removed_tags_leave_the_marginal_of_the_others(rng):
     tags = tag_filter(rng)
-    B, P = tags.orientations.B.copy(), tags.joint.P.copy()
+    B, P = tags.observer.orientations.B.copy(), tags.joint.P.copy()
     tags.remove(np.array([1]))
     kept = np.r_[0:12, 18:24]
-    np.testing.assert_array_equal(tags.orientations.B, B[[0, 2]])
+    np.testing.assert_array_equal(tags.observer.orientations.B, B[[0, 2]])
     np.testing.assert_array_equal(tags.joint.P, P[np.ix_(kept, kept)])

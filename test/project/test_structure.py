@@ -50,10 +50,10 @@ def test_docstrings_are_a_fifth_of_all_lines_at_most(structure):
     assert docstrings <= 0.2 * lines
 
 
-def test_filters_are_distinguished_by_what_they_have_not_by_name():
+def test_gains_are_distinguished_by_what_they_have_not_by_name():
     for path in PACKAGE.rglob('*.py'):
         text = path.read_text(encoding='utf-8')
-        assert not re.search(r'isinstance\([^)]*Filter\)', text), path
+        assert not re.search(r'isinstance\([^)]*Gains\)', text), path
         assert not re.search(r"[!=]= '(riccati|scheduled|constant)'", text), path
 
 

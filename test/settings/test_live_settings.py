@@ -72,10 +72,10 @@ def bits_of(estimator):
     if estimator.last_update is not None:
         found += [getattr(estimator.last_update, f.name) for f in fields(estimator.last_update)]
     for hypothesis in estimator._hypotheses._all:
-        known = hypothesis.state.filter
-        found += [hypothesis.cost, known.observer.A, known.points, known.observer.u]
-        has_joint, rows = known.has_joint_covariance, np.arange(len(known.points))
-        found.append(known.joint.P if has_joint else known.joint_covariance(rows))
+        gains, observer = hypothesis.state.gains, hypothesis.state.observer
+        found += [hypothesis.cost, observer.A, observer.points, observer.u]
+        rows = np.arange(len(observer))
+        found.append(gains.errors.joint.P if gains.errors else gains.joint_covariance(rows))
     return found
 
 
@@ -197,7 +197,7 @@ def test_all_hypotheses_follow_a_change():
     estimator.change_settings(replace(settings, huber_threshold=0.5, rejection_threshold=3.0))
     for hypothesis in estimator._hypotheses._all:
         state = hypothesis.state
-        for owner in (state.filter, state.relinearisation):
+        for owner in (state.gains, state.relinearisation):
             assert owner._settings.huber_threshold == 0.5
             assert owner._settings.rejection_threshold == 3.0
         assert state.settings.rejection_threshold == 3.0

@@ -29,7 +29,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
@@ -343,9 +343,9 @@ def test_where_all_is_linear_relinearising_changes_nothing(two_d_mode, max_landm
 )
 def test_it_relinearises_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
     settings = Settings(relinearization_interval=20, relinearization_angle=0.2)
-    riccati, before = RiccatiFilter(settings, np.eye(4)), se3.exp(np.arange(6.0))
+    riccati, before = RiccatiGains(settings, np.eye(4)), se3.exp(np.arange(6.0))
     riccati.add_known(KnownLandmarks(np.eye(3), np.tile(np.eye(3), (3, 1, 1))))
-    relinearisation = Relinearisation(riccati, settings)
+    relinearisation = Relinearisation(riccati.errors, riccati.calibration, settings)
     one_point = np.array([0]), np.eye(3)[:1], np.eye(3)[:1], np.eye(3)[None], np.array([np.inf])
     summarised = []
     for turn_rad in turns_rad:

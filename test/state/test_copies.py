@@ -14,7 +14,7 @@ from slam_observer_ros.common.types import LandmarkColumns
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.settings.estimator_settings import Settings
 
 EVERYTHING = Settings(
@@ -40,7 +40,7 @@ def fixture_run(request, monkeypatch):
     """Settings, and events that suit them."""
     settings = KINDS[request.param]
     if request.param == 'large map':
-        monkeypatch.setattr(RiccatiFilter, 'block', BlockSize(dense=8, most=6, kept=3))
+        monkeypatch.setattr(RiccatiGains, 'block', BlockSize(dense=8, most=6, kept=3))
     world = drive(settings, 12.0, landmarks=24)
     if settings.use_tag_orientation:
         world = world.with_observations(with_orientations)
@@ -55,9 +55,9 @@ def with_orientations(_, event):
 def known_of(estimator):
     """All numbers that the state has, one by one, copied."""
     state = estimator._state
-    filter_, rows = state.filter, np.arange(len(state.landmarks))
-    known = [filter_.observer.A, filter_.points, filter_.observer.u, filter_.calibration.values]
-    known += [filter_.joint_covariance(rows), filter_.landmark_covariances()]
+    observer, rows = state.observer, np.arange(len(state.landmarks))
+    known = [observer.A, observer.points, observer.u, state.calibration.values]
+    known += [state.gains.joint_covariance(rows), state.landmark_covariances()]
     known += [getattr(state.landmarks, name) for name in state.landmarks.COLUMNS]
     if state.relinearisation is not None:
         known += [np.array(state.relinearisation.history.poses)]

@@ -15,7 +15,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.observer import core
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
-from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import match
 from slam_observer_ros.state.step import step
@@ -52,17 +52,17 @@ def parts(state):
         state.landmarks,
     )
     latest = history._new[-1].keyframe if history._new else None
+    noise, sensitivity, drift = history._motion or history._at_rest()
     return {
         'A': state.observer.A,
-        'a': state.observer.a,
-        'P': state.filter.joint.P,
-        'map': state.filter.points,
-        'calibration': state.filter.calibration.values,
+        'P': state.errors.joint.P,
+        'map': state.observer.points,  # y° + â: what has hardly moved has no size of its own
+        'calibration': state.calibration.values,
         'factors': np.concatenate([factors._logs, factors._information.ravel(), factors.applied]),
         'shares': np.zeros(()) if factors._shares is None else factors._shares,
-        'noise': history._motion_noise,
-        'sensitivity': history._sensitivity,
-        'drift': history._drift,
+        'noise': noise,
+        'sensitivity': sensitivity,
+        'drift': drift,
         'end velocity': np.zeros(0) if state._end_velocity is None else state._end_velocity,
         'table': np.concatenate(
             [table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns]
@@ -189,14 +189,14 @@ def test_a_usual_step_is_the_general_one_to_rounding(worlds, monkeypatch, name):
 
 @pytest.mark.parametrize('name', ['simulated loop, 3D stereo', 'simulated loop, wheeled'])
 def test_so_it_is_where_few_landmarks_of_a_large_map_are_active(worlds, monkeypatch, name):
-    monkeypatch.setattr(RiccatiFilter, 'block', BlockSize(8, 10, kept=4, kept_per_seen=1))
+    monkeypatch.setattr(RiccatiGains, 'block', BlockSize(8, 10, kept=4, kept_per_seen=1))
     world, both = worlds.load(name), BothWays(monkeypatch)
     estimator = Estimator(world.settings, judges_innovations=True)
     for event in world.events:
         estimator.add(event)
         if isinstance(event, ObservationEvent) and both.observed >= 2 * OBSERVATIONS:
             break
-    joint = estimator._state.filter.joint
+    joint = estimator._state.errors.joint
     assert not joint.is_dense and len(joint.active) < len(estimator.world_points)
     assert both.used[usual] >= USUAL_SHARE * both.observed
     assert both.entered >= 5

@@ -20,13 +20,13 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.chart import sheared
-from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
-from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -51,7 +51,7 @@ class CompressedCovariance(JointCovariance):
     active: IntArray
     is_dense = False
 
-    def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
+    def __init__(self, dense: JointCovariance, observer: FilterArrays, size: BlockSize) -> None:
         vars(self).update(vars(dense))
         self._form, self._observer, self._size = copy(dense), observer, size
         self._form._matrix = SymmetricMatrix(self.of_robot)
@@ -60,11 +60,12 @@ class CompressedCovariance(JointCovariance):
         self._set_active(np.arange(n), n)
         self._following = FollowingLandmarks(self.chart, observer)
         self._checks, self._has_moved, self._most = 0, False, size.most
+        observer.postponed = self
 
-    def copy(self, observer: Observer) -> Self:
+    def copy(self, observer: FilterArrays) -> Self:
         """Return an independent copy, which shares what takes much memory until it changes."""
         other = super().copy(observer)
-        other._observer = observer
+        other._observer, observer.postponed = observer, other
         other._following = self._following.copy(observer)
         return other
 
@@ -79,7 +80,7 @@ class CompressedCovariance(JointCovariance):
     @property
     def references(self) -> FloatArray:
         """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
-        points = self._observer.points
+        points = self._observer.y_ref + self._observer.a
         for view in self._following.views(self._others):
             points[view.rows] = view.references
         return points
@@ -125,10 +126,6 @@ class CompressedCovariance(JointCovariance):
             some = range(first, len(self._outside.panels), CHECK_INTERVAL)
             if not self._following.are_near(some):
                 self._restart(self.active[:0])
-
-    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
-        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
-        return a + self.postponed_shifts(rows)
 
     def postponed_shifts(self, rows: IntArray) -> FloatArray:
         """Return how far the observer has yet to move landmarks (m, 3), metres."""
@@ -214,7 +211,7 @@ class CompressedCovariance(JointCovariance):
         return self.marginal(every).of_landmarks(at, points, of_tags)
 
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
+        """Return what orientations ``B`` (m, 3, 3) of tags are with all that is postponed."""
         every = np.tile(np.eye(3), (len(self._places), 1, 1))
         for view in self._following.views(np.unique(rows[self._places[rows] < 0])):
             every[view.rows] = view.turns
@@ -240,7 +237,7 @@ class CompressedCovariance(JointCovariance):
         """Return the same with all landmarks in P, which the observer has moved."""
         self._apply()
         joint = self.marginal(np.arange(len(self._places)))
-        self.P = joint.P
+        self.P, self._observer.postponed = joint.P, None
         joint._matrix = self._matrix
         return joint
 
@@ -292,7 +289,8 @@ class CompressedCovariance(JointCovariance):
         """Return the landmarks to be active when ``rows`` (m,) are seen."""
         kept = max(self._size.kept, self._size.kept_per_seen * len(rows))
         # But landmarks that are just being added; a postponed shift makes no difference here.
-        arms = self._observer.points[: len(self._places)] - self._observer.A[:3, 3]
+        observer, n = self._observer, len(self._places)
+        arms = observer.y_ref[:n] + observer.a[:n] - observer.A[:3, 3]
         distances = np.einsum('ij,ij->i', arms, arms)
         near = np.argpartition(distances, min(kept, len(arms)) - 1)[:kept]
         wanted = np.union1d(rows, near)
@@ -321,7 +319,7 @@ class CompressedCovariance(JointCovariance):
         all_slots[new] = outside.new_slots(len(new))
         released = released[np.argsort(all_slots[released])]
         columns = self.chart.of_landmarks(self._places[released])
-        points = self._observer.points[released]
+        points = self._observer.y_ref[released] + self._observer.a[released]
         # η = ξ − T ε with x and with each other.
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]

@@ -6,8 +6,8 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.motion import Motion
 
 
@@ -15,6 +15,7 @@ class ExactMapCovariance(JointCovariance):
     """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
 
     active = slice(0)
+    is_dense = False
 
     def __init__(self, joint: JointCovariance, covariances: FloatArray) -> None:
         chart = joint.chart.with_postponed(0)

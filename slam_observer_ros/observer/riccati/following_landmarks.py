@@ -12,8 +12,8 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.chart import Chart
-from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.riccati.outside_landmarks import (
     Moved,
     OutsideLandmarks,
@@ -34,7 +34,7 @@ FOLDING = 3e7
 class FollowingLandmarks:
     """The landmarks of an observer that are not in P, and what has yet to be done to them."""
 
-    def __init__(self, chart: Chart, observer: Observer) -> None:
+    def __init__(self, chart: Chart, observer: FilterArrays) -> None:
         self._axes, self._stride, self._has_turns = chart.axes, chart.stride, chart.turn > 0
         self._observer = observer
         self.outside = OutsideLandmarks(chart)
@@ -44,7 +44,7 @@ class FollowingLandmarks:
         self.start(np.empty(0))
         self._changed = 0  # panels, since the last correction
 
-    def copy(self, observer: Observer) -> FollowingLandmarks:
+    def copy(self, observer: FilterArrays) -> FollowingLandmarks:
         """Return an independent copy for a copy of the observer."""
         other = copy(self)
         other._observer = observer

@@ -8,30 +8,58 @@ are taken to be independent, so to first order that is the same as both at once.
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.gains import Errors, Gains, TagGains
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import (
     flip_verdicts,
     SeenOrientations,
 )
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 
 
-class OrientationGains(Filter):
-    """What a filter with a joint covariance does with orientations, if it estimates them."""
+class OrientationGains(Gains):
+    """What gains with a joint covariance do with orientations, where these are estimated."""
 
-    joint: JointCovariance
+    errors: Errors
 
+    @property
+    def joint(self) -> JointCovariance:
+        """P, in the form that suits the map."""
+        return self.errors.joint
+
+    @joint.setter
+    def joint(self, joint: JointCovariance) -> None:
+        self.errors.joint = joint
+
+    @property
+    def tags(self) -> TagGains | None:
+        """Itself, where orientations are estimated."""
+        return self if self.joint.chart.turn else None
+
+    @abstractmethod
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x)."""
-        raise NotImplementedError
+
+    def learn_motion_noise(self, residuals: Residuals) -> None:
+        """Let residuals show how noisy the motion was, if something else than them corrects it."""
+        if len(residuals.rows):
+            S = self.errors.innovation_covariance(residuals)
+            self._learn_motion_noise(residuals, residuals.on(self.axes)[0], S)
+
+    def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:
+        # C as the prediction has it: in the middle between where landmarks are expected and seen.
+        C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
+        self.motion_noise.factors.learn(r, S, C)
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Move the state by what is seen of known orientations.
@@ -62,22 +90,22 @@ class OrientationGains(Filter):
 
     def add_orientations(self, seen: SeenOrientations) -> None:
         """Take over orientations as they are seen, where none is known."""
-        self.orientations.put(seen.rows, self.observer.A[:3, :3] @ seen.Z)
+        self.observer.orientations.put(seen.rows, self.observer.A[:3, :3] @ seen.Z)
         self.joint.add_turns(seen.rows, self._noise(seen.covariances), seen.D)
 
     def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
         """Take in orientations of a map, whose errors are independent of all else."""
-        own = self.orientations.are_known[rows] & (not self.is_exact)
+        own = self.observer.orientations.are_known[rows] & (not self.observer.is_exact)
         new, seen = ~own, self._settings.max_rejections
-        self.orientations.put_known(rows[new], B[new], sigmas[new], seen)
-        if self.is_exact:
+        self.observer.orientations.put_known(rows[new], B[new], sigmas[new], seen)
+        if self.observer.is_exact:
             return
         variances = np.maximum(sigmas, RESOLUTION_RAD)[:, None, None] ** 2
         R = variances * np.eye(self.axes.turn)
         self.joint.add_known_turns(rows[new], R[new])
         # Of tags that both have, B̂_i B_iᵀ = exp(ω_i), unless they contradict each other.
         known, R = rows[own], R[own]
-        omega = self.axes.turns(so3.log(self.orientations.B[known] @ transpose(B[own])))
+        omega = self.axes.turns(so3.log(self.observer.orientations.B[known] @ transpose(B[own])))
         near = mahalanobis(omega, self.joint.own_turns(known) + R)
         agree = near <= self._settings.rejection_threshold
         if agree.any():
@@ -86,21 +114,10 @@ class OrientationGains(Filter):
             S = with_blocks(HPH, R[agree])
             self._move(-self.joint.update(HP, S, omega[agree].ravel()))
 
-    def orientation_matrices(self, rows: IntArray) -> FloatArray:
-        """Return B̂_i (m, 3, 3) of landmarks, zero for those that have none."""
-        return self.joint.turned(rows, self.orientations.B[rows])
-
-    def orientation_sigmas(self, rows: IntArray) -> FloatArray:
-        """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
-        if self.is_exact:
-            return self.orientations.map_sigmas[rows]
-        largest = np.linalg.eigvalsh(self.joint.own_turns(rows))[:, -1]
-        return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
-
     def _turns(self, rows: IntArray, Z: FloatArray) -> FloatArray:
         """Return φ_i (m, q), rad, of orientations ``Z`` (m, 3, 3) seen, body frame."""
         R_hat = self.observer.A[:3, :3]
-        return self.axes.turns(so3.log(R_hat @ Z @ transpose(self.orientations.B[rows])))
+        return self.axes.turns(so3.log(R_hat @ Z @ transpose(self.observer.orientations.B[rows])))
 
     def _noise(self, covariances: FloatArray) -> FloatArray:
         """Return covariances of the body frame (m, q, q) along the reference frame's axes."""
@@ -119,16 +136,16 @@ class OrientationGains(Filter):
     def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
         """Take in what a map knows of the orientations of landmarks ``rows`` (m,)."""
         tags, R, sigmas = known.tags, known.orientations, known.sigmas
-        if R is None or sigmas is None or not self.estimates_orientations:
+        if R is None or sigmas is None or self.tags is None:
             return
         if known.joint is None:
             self.know_orientations(rows[tags], R[tags], sigmas[tags])
         else:  # their errors have been taken in with those of the positions
             seen = self._settings.max_rejections
-            self.orientations.put_known(rows[tags], R[tags], sigmas[tags], seen)
+            self.observer.orientations.put_known(rows[tags], R[tags], sigmas[tags], seen)
 
     def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
-        tags = self.orientations
+        tags = self.observer.orientations
         in_map, own = tags.are_known[copies], tags.are_known[rows]
         if not in_map.any():
             return

@@ -5,7 +5,7 @@ of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i f
 
     H_i = [ 0  I  0 … −I … 0 ],
 
-or with R̂ D_i at the calibration of the sensor that saw it (:mod:`.sensor_calibration`), and what
+or with R̂ D_i at the calibration of the sensor that saw it (:mod:`.calibration`), and what
 no observation can determine, the choice of the world's frame, is exactly in its null space: the
 covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
 X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
@@ -14,21 +14,17 @@ in large maps less: :mod:`.compressed_covariance`.
 
 from __future__ import annotations
 
-from typing import ClassVar, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import (
-    block_diagonal,
-    mahalanobis,
-    solve_symmetric,
-    with_blocks,
-)
+from slam_observer_ros.geometry.matrices import block_diagonal, solve_symmetric, with_blocks
 from slam_observer_ros.observer.chart import Chart
-from slam_observer_ros.observer.filter import OF_CONSTANT_GAINS
+from slam_observer_ros.observer.gains import Errors, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.observer.residuals import Residuals, SeenPoints
@@ -37,10 +33,9 @@ from slam_observer_ros.observer.riccati.compressed_covariance import (
     CompressedCovariance,
 )
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.observer.robust import observation_weights
-from slam_observer_ros.sensor_models.motion import Motion, Passage
+from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -59,11 +54,9 @@ a thing have quite the same centre.
 """
 
 
-class RiccatiFilter(OrientationGains):
+class RiccatiGains(OrientationGains):
     """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
 
-    joint: JointCovariance
-    has_joint_covariance: ClassVar[bool] = True
     ignores = OF_CONSTANT_GAINS
     block = BlockSize()  # of large maps
 
@@ -72,26 +65,31 @@ class RiccatiFilter(OrientationGains):
         # What is estimated of each landmark beside its position, and how little is known of it:
         # its velocity, or the orientation of a tag at rest.
         speed = settings.landmark_velocity_stddev
-        self.estimates_orientations = settings.use_tag_orientation and not speed
         velocity = self.axes.point if speed else 0
-        turn = self.axes.turn if self.estimates_orientations else 0
+        turn = self.axes.turn if settings.use_tag_orientation and not speed else 0
         unknown = [UNKNOWN_RAD] * turn + [speed] * velocity
-        self.joint = JointCovariance(
+        joint = JointCovariance(
             Chart(self.axes, self.calibration.count, turn, velocity),
             self.observer.covariance,
             self.calibration.initial_covariance(),
             np.array(unknown) ** 2,
         )
+        self.errors = Errors(self.observer, joint, self.axes)
+
+    @staticmethod
+    def estimated(settings: Settings) -> Settings:
+        """Return the settings with as much of a calibration as is estimated: all."""
+        return settings
 
     def copy(self) -> Self:
         """Return an independent copy."""
         other = super().copy()
-        other.joint = self.joint.copy(other.observer)
+        other.errors = self.errors.copy(other.observer)
         return other
 
-    def propagate(self, motion: Motion) -> None:
+    def advance(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to P."""
-        super().propagate(motion)
+        super().advance(motion)
         self.joint.note_motion()
         observer, active = self.observer, self.joint.active
         points = observer.y_ref[active] + observer.a[active]
@@ -103,7 +101,7 @@ class RiccatiFilter(OrientationGains):
         self.joint.activate(rows)
         return super().residuals(rows, seen, dt_s)
 
-    def correct(self, residuals: Residuals) -> FloatArray:
+    def observe(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
         m = len(residuals.rows)
         if m <= AT_ONCE:
@@ -125,7 +123,7 @@ class RiccatiFilter(OrientationGains):
         """Update P; return −K r, and the weight (m,) of each point."""
         r, R = residuals.on(self.axes)
         # A gate, then Huber's weights; errors that last make R larger, too.
-        predicted = self.predicted(residuals)[1]
+        predicted = self.errors.predicted(residuals)[1]
         self._learn_motion_noise(residuals, r, with_blocks(predicted, R))
         weights = observation_weights(r, predicted, R, self._settings)
         passed, used = weights > 0.0, residuals
@@ -135,33 +133,6 @@ class RiccatiFilter(OrientationGains):
         R = R * (repeated / weights[passed])[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
         return self.joint.correct(self.joint.output_matrix(used), used.rows, R, r), weights
-
-    def learn_motion_noise(self, residuals: Residuals) -> None:
-        """Let residuals show how noisy the motion was, if something else than them corrects it."""
-        if len(residuals.rows):
-            S = self.innovation_covariance(residuals)
-            self._learn_motion_noise(residuals, residuals.on(self.axes)[0], S)
-
-    def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:
-        # C as the prediction has it: in the middle between where landmarks are expected and seen.
-        C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
-        self.motion_noise.factors.learn(r, S, C)
-
-    def distances(self, residuals: Residuals) -> FloatArray:
-        """Return the Mahalanobis distance (m,) of each residual."""
-        r, R = residuals.on(self.axes)
-        C = self.joint.output_matrix(residuals, chord=0.5)
-        _, predicted = self.joint.output(C, residuals.rows)
-        return mahalanobis(r, predicted + R)
-
-    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
-        """Return the joint covariance (m k, m k) of residuals, noise included."""
-        return with_blocks(self.predicted(residuals)[1], residuals.on(self.axes)[1])
-
-    def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-        """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
-        C = self.joint.output_matrix(residuals, chord=0.5)
-        return self.joint.outputs(C, residuals.rows)
 
     def add_sensor(self, frame: str) -> None:
         """Let the calibration of the sensor of another frame be part of the state, and of P."""
@@ -183,11 +154,12 @@ class RiccatiFilter(OrientationGains):
         if known.joint is None:
             self._compress_if_large(len(known))
             self.joint.add_known(known.points, known.covariances)
-            super().add_known(known)
-            return
-        self.joint = self.joint.dense()
-        self.joint.add_correlated(known)
+        else:
+            self.joint = self.joint.dense()
+            self.joint.add_correlated(known)
         super().add_known(known)
+        n = len(self.observer)
+        self.take_orientations(np.arange(n - len(known), n), known)
         self._compress_if_large(0)
 
     def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
@@ -201,16 +173,18 @@ class RiccatiFilter(OrientationGains):
         self.joint.remove(rows)
         super().remove(rows)
 
-    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+    def fix_landmarks(self, known: KnownLandmarks) -> None:
         """Take all landmarks for exact; P is that of pose and calibration from now on."""
-        super().fix_landmarks(y_ref, covariances)
-        self.joint = ExactMapCovariance(self.joint, covariances)
+        super().fix_landmarks(known)
+        self.joint = ExactMapCovariance(self.joint, known.covariances)
+        self.observer.postponed = None
+        self.take_orientations(np.arange(len(known)), known)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
         super().set_pose(pose, covariance)
         self.motion_noise.factors.forget_motion()
-        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.points)
+        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.observer.points)
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
@@ -233,10 +207,11 @@ class RiccatiFilter(OrientationGains):
         """
         if known.joint is None:
             super().enter_map(rows, known)
+            self.take_orientations(rows, known.select(np.arange(len(rows))))
             return
         # The map beside the estimate, whose gauge γ does not move it, …
         n, m = len(self.observer), len(rows)
-        own = self.points[rows]
+        own = self.observer.points[rows]
         self.add_known(known)
         self.joint = joint = self.joint.dense()
         added = n + np.arange(len(known))
@@ -282,43 +257,20 @@ class RiccatiFilter(OrientationGains):
     def _moved_points(self, rows: IntArray, x: FloatArray) -> FloatArray:
         """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
         X = self.joint.chart.step(x).X
-        return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a[rows])
+        return np.asarray(se3.rotate(X.A, self.observer.points[rows]) + X.a[rows])
 
     @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
         return self.joint.calibration_variances
 
-    def pose_covariance(self, motion: Motion | Passage | None = None) -> FloatArray:
-        """Return the covariance (…, 6, 6) of ε, zero on axes that are not estimated."""
-        if motion is None:
-            return self.axes.full_pose_covariance(self.joint.pose)
-        return self.axes.full_pose_covariance(motion.pose_covariance(self.joint.of_robot))
-
-    def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
-        """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
-        points = self.points + duration_s * self.observer.u
-        return self.joint.landmarks(points, duration_s)
-
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
-        return self.joint.with_pose(rows, self.points[rows])
+        return self.errors.joint_covariance(rows)
 
-    @property
-    def points(self) -> FloatArray:
-        """(n, 3) estimated landmarks, reference frame, metres."""
-        observer = self.observer
-        return observer.y_ref + self.joint.followed(np.arange(len(observer)), observer.a)
-
-    def expected_points(self, rows: IntArray) -> FloatArray:
-        """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
-        observer = self.observer
-        y_ref, a = (of.take(rows, axis=0, mode='wrap') for of in (observer.y_ref, observer.a))
-        return observer.in_body_frame(y_ref + self.joint.followed(rows, a))
-
-    def translations(self, rows: IntArray) -> FloatArray:
-        """Return â_i (m, 3) of landmarks, metres."""
-        return self.joint.followed(rows, super().translations(rows))
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        return self.errors.distances(residuals)
 
     def _compress_if_large(self, added: int) -> None:
         """Go on with a covariance for many landmarks, unless they move or P has none of them."""
@@ -326,8 +278,7 @@ class RiccatiFilter(OrientationGains):
         count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
         is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        has_them = self.joint.is_dense and not isinstance(self.joint, ExactMapCovariance)
-        if has_them and is_large and not may_move:
+        if self.joint.is_dense and is_large and not may_move:
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
@@ -339,4 +290,4 @@ class RiccatiFilter(OrientationGains):
         if step.velocities is not None:
             observer.correct_velocities(X.A, moved, step.velocities)
         if step.turns is not None:
-            self.orientations.turn(moved, so3.exp(step.turns))
+            observer.orientations.turn(moved, so3.exp(step.turns))

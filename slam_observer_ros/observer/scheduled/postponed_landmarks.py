@@ -83,9 +83,9 @@ class PostponedLandmarks:
         """Let the estimate of z be moved by x (q,)."""
         self._x += self._G @ x
 
-    def postponed_shifts(self) -> FloatArray:
-        """Return how far each landmark (n, 3) has yet to be moved, metres."""
-        return self._followed(self._F, self._group) + self._shifts
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far landmarks (m, 3) have yet to be moved, metres."""
+        return self._followed(self._F[rows], self._group[rows]) + self._shifts[rows]
 
     def now(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return F (m, k, q), N (m, k, k) and the moves (m, 3) that landmarks have yet to make."""

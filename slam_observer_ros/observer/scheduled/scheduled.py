@@ -36,12 +36,13 @@ from slam_observer_ros.geometry.matrices import (
     symmetric,
     transpose,
 )
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, OF_JOINT_COVARIANCES
+from slam_observer_ros.observer.gains import Gains, OF_CONSTANT_GAINS, OF_JOINT_COVARIANCES
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals, SeenPoints
 from slam_observer_ros.observer.robust import huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled.core import Core, regression
+from slam_observer_ros.sensor_models.calibration import without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -61,7 +62,7 @@ class _Step:
     weights: FloatArray  # (m,) Huber's weights, zero where the gate rejects a point
 
 
-class ScheduledFilter(Filter):
+class ScheduledGains(Gains):
     """Gains from the covariance of a small core and how each landmark depends on it."""
 
     ignores = (
@@ -75,21 +76,33 @@ class ScheduledFilter(Filter):
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
         self._core = Core(self.axes, self.calibration)
-        self._postponed = self._core.postponed
+        self._postponed = self.observer.postponed = self._core.postponed
+
+    @staticmethod
+    def estimated(settings: Settings) -> Settings:
+        """Return the settings with as much of a calibration as is estimated."""
+        return without_sensor_calibration(settings)
 
     def copy(self) -> Self:
         """Return an independent copy."""
         other = super().copy()
         other._core = self._core.copy(other.calibration)
-        other._postponed = other._core.postponed
+        other._postponed = other.observer.postponed = other._core.postponed
         return other
 
-    def propagate(self, motion: Motion) -> None:
+    def advance(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to the core's."""
-        super().propagate(motion)
+        super().advance(motion)
         self._core.predict(motion)
 
-    def correct(self, residuals: Residuals) -> FloatArray:
+    def prepare(self, rows: IntArray) -> None:
+        """Bring landmarks (m,) up to date that are going to be observed; −1 for a new one."""
+        rows = np.union1d(rows[rows >= 0], self._postponed.due())  # others, whose turn it is
+        F, N, shifts = self._postponed.now(rows)
+        self._postponed.update(rows, F, N)
+        self.observer.a[rows] += shifts
+
+    def observe(self, residuals: Residuals) -> FloatArray:
         """Move the state by the step of all points; return the weight that each was given."""
         # What the points that pass the gate ask for.
         rows = residuals.rows
@@ -143,17 +156,12 @@ class ScheduledFilter(Filter):
         super().remove(rows)
         self._core.remove(rows)
 
-    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+    def fix_landmarks(self, known: KnownLandmarks) -> None:
         """Take all landmarks for exact."""
-        super().fix_landmarks(y_ref, covariances)
-        count, k = len(y_ref), self.axes.point
+        super().fix_landmarks(known)
+        count, k = len(known), self.axes.point
         self._core.remove(np.arange(len(self._postponed)))
         self._postponed.add(np.zeros((count, k, len(self._core.P))), np.zeros((count, k, k)))
-
-    def expected_points(self, rows: IntArray) -> FloatArray:
-        """Return where landmarks, brought up to date, should be seen (m, 3), body frame."""
-        self._bring_up_to_date(rows[rows >= 0])
-        return super().expected_points(rows)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
@@ -165,7 +173,7 @@ class ScheduledFilter(Filter):
         # All are up to date, and z is the pose (and calibration): ã_i = F_i (z − γ) + J_i γ + η_i.
         self._core.dismiss(self._core.rows)
         everything, p = np.arange(len(self._postponed)), self.axes.p
-        self._bring_up_to_date(everything)
+        self.prepare(everything)
         m, k, q = len(r), self.axes.point, len(self._core.P)
         F, N, _ = self._postponed.now(everything)
         J = self.axes.output_matrix(self.observer.points)
@@ -196,30 +204,21 @@ class ScheduledFilter(Filter):
         self._move(everything, -x[z], shifts)
 
     @property
-    def points(self) -> FloatArray:
-        """(n, 3) estimated landmarks, reference frame, metres: where they are yet to be moved."""
-        return self.observer.points + self._postponed.postponed_shifts()
-
-    @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
         p = self.axes.p
         variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
         return variances
 
-    def joint_covariance(self, rows: IntArray) -> FloatArray:
-        """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
+    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks; None in an exact map."""
+        if self.observer.is_exact:
+            return None
         F, N, _ = self._postponed.now(rows)
         p, q = self.axes.p, len(self._core.P)
         joint = self._with_landmarks(F, N)
         columns = np.append(np.arange(p), np.arange(q, len(joint)))
         return joint[np.ix_(columns, columns)]
-
-    def _bring_up_to_date(self, rows: IntArray) -> None:
-        rows = np.union1d(rows, self._postponed.due())  # others, whose turn it is
-        F, N, shifts = self._postponed.now(rows)
-        self._postponed.update(rows, F, N)
-        self.observer.a[rows] += shifts
 
     def _reweighted_step(
         self, residuals: Residuals, H: FloatArray, N: FloatArray, passed: BoolArray

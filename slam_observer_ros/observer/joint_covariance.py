@@ -20,11 +20,11 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.chart import Chart, sheared
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.motion import Motion
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class JointCovariance:
     def P(self, covariance: FloatArray) -> None:  # noqa: N802
         self._matrix.set(covariance)
 
-    def copy(self, observer: Observer) -> Self:
+    def copy(self, observer: FilterArrays) -> Self:
         """Return an independent copy for a copy of the observer, which has one of P."""
         other = copy(self)
         other._matrix = observer.covariance
@@ -142,12 +142,8 @@ class JointCovariance:
         """Return the same with all landmarks in P."""
         return self
 
-    def followed(self, rows: IntArray, a: FloatArray) -> FloatArray:
-        """Return what â_i (m, 3) of landmarks are with all that is postponed."""
-        return a
-
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags are likewise."""
+        """Return what orientations ``B`` (m, 3, 3) of tags are with all that is postponed."""
         return B
 
     # The step
