@@ -112,6 +112,18 @@ class ActiveLandmarks(JointCovariance):
             if not self._following.are_near(some):
                 self._restart(self.active[:0])
 
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far the observer has yet to move landmarks (m, 3), metres."""
+        # Not done here: those who look at the map must not change the bits of the estimate.
+        others = rows[self._places[rows] < 0]
+        if not len(others):  # as nearly always
+            return np.zeros((len(rows), 3))
+        shifts = np.zeros((len(self._places), 3))
+        for view in self._following.views(others):
+            shifts[view.rows] = view.shifts
+        chosen: FloatArray = shifts[rows]
+        return chosen
+
     def add_seen(self, covariances: FloatArray, D: FloatArray | None = None) -> None:
         """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3), R̂ D_i."""
         for start in range(0, len(covariances), self._size.most):

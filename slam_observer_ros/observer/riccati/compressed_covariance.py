@@ -34,18 +34,6 @@ class CompressedCovariance(ActiveLandmarks):
             points[view.rows] = view.references
         return points
 
-    def postponed_shifts(self, rows: IntArray) -> FloatArray:
-        """Return how far the observer has yet to move landmarks (m, 3), metres."""
-        # Not done here: those who look at the map must not change the bits of the estimate.
-        others = rows[self._places[rows] < 0]
-        if not len(others):  # as nearly always
-            return np.zeros((len(rows), 3))
-        shifts = np.zeros((len(self._places), 3))
-        for view in self._following.views(others):
-            shifts[view.rows] = view.shifts
-        chosen: FloatArray = shifts[rows]
-        return chosen
-
     # Landmarks
 
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
