@@ -153,9 +153,9 @@ and by 0.017 m against the fitted ones (`python benchmark/oracle.py`).
 ANEES: every 5 s, the mean over the Monte Carlo runs of the squared error of the pose (or the
 landmarks) normalised by its covariance and its degrees of freedom; then the mean and the range
 over the run. The band in each table contains 95 % of a consistent estimator's values. There the
-robot moves between two velocities as white noise has it, which all of these estimators assume. Where
-a velocity is off by the same for all of its period, as in the simulated loops, and landmarks are seen
-in between, `riccati` is too careful: its pose's ANEES is 0.74 in the 3D loop and 0.93 in the wheeled one.
+robot moves between two velocities as white noise has it, which all of these estimators assume.
+Where a velocity is off by the same for all of its period, as in the simulated loops, and landmarks
+are seen in between, `riccati` is too careful: its pose's ANEES is 0.74 in 3D and 0.93 on wheels.
 
 ![Configuration error and consistency](images/benchmark.png)
 
