@@ -43,6 +43,9 @@ QUEUE_DEPTH = 10_000
 LANDMARKS_MAX_WAIT_S = 60.0
 """Long, for the same reason: landmarks that have waited are used."""
 
+LATE_LIMIT_S = 2.0
+"""For so long a busy machine may hold the observer up, in real time."""
+
 STALL_LIMIT_S = 30.0
 LAST_MESSAGES_S = 0.5
 STOP_LIMIT_S = 10.0
@@ -149,6 +152,7 @@ def _observer(options: argparse.Namespace, folder: Path) -> NodeContext:
         landmarks_qos='reliable',
         queue_depth=QUEUE_DEPTH,
         landmarks_max_wait=LANDMARKS_MAX_WAIT_S,
+        late_limit=min(60.0, LATE_LIMIT_S * max(1.0, options.real_time_factor)),
         publish_rate=PUBLISH_RATE_HZ,
         use_sim_time=_is_simulated_time(options),
     )

@@ -170,10 +170,10 @@ class McapRecords:
             self._gap_ns += max(first_ns - self.end_ns, 0)
             self._is_behind_damage = False
         self.start_ns, self.end_ns = min(self.start_ns, first_ns), max(self.end_ns, last_ns)
-        channels, counts = np.unique(heads['channel'], return_counts=True)
-        self._counts.update(dict(zip(channels.tolist(), counts.tolist(), strict=True)))
-        found = frozenset(channels.tolist())
-        self.pieces.append(piece._replace(start_ns=first_ns, channels=found))
+        counts = np.bincount(heads['channel'])
+        channels = np.flatnonzero(counts).tolist()
+        self._counts.update(dict(zip(channels, counts[channels].tolist(), strict=True)))
+        self.pieces.append(piece._replace(start_ns=first_ns, channels=frozenset(channels)))
 
 
 def _next_whole(data: mmap.mmap, place: int, channels: Collection[int]) -> int:
@@ -248,7 +248,10 @@ def _indexed(data: mmap.mmap, place: int) -> IntArray:
             break
         entries = data[begin:place]
         found.append(np.frombuffer(entries[: len(entries) // 16 * 16], '<u8')[1::2])
-    return np.unique(np.concatenate(found)).astype(np.int64)
+    # Each index is in order, and so stable sorting merges them in one pass.
+    begins = np.sort(np.concatenate(found).astype(np.int64), kind='stable')
+    distinct: IntArray = begins[np.diff(begins, prepend=-1) != 0]
+    return distinct
 
 
 def _begins(content: bytes, indexed: IntArray, take: _Take) -> IntArray:
@@ -261,7 +264,7 @@ def _begins(content: bytes, indexed: IntArray, take: _Take) -> IntArray:
     others = starts != stops
     between = zip(starts[others].tolist(), stops[others].tolist(), strict=True)
     walked = [_walked(content, begin, end, take) for begin, end in between]
-    return np.sort(np.concatenate([indexed, *walked]))
+    return np.sort(np.concatenate([indexed, *walked]), kind='stable')
 
 
 def _walked(content: bytes, place: int, end: int, take: _Take) -> IntArray:

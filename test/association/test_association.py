@@ -349,13 +349,11 @@ def test_numbers_given_to_landmarks_in_two_runs_say_nothing_of_which_is_which():
     assert_allclose(places[max(places)], nameless_point[0], atol=0.05)
 
 
-def test_without_ids_real_robots_are_hardly_worse_off(data_dir):
+@pytest.mark.parametrize(('robot', 'limit'), [(2, 1.25), (3, 1.35)])
+def test_without_ids_real_robots_are_hardly_worse_off(data_dir, robot, limit):
     """Commands as odometry, blind for a minute at a time, posts of two or three barcodes."""
-    ratios = []
-    for robot in (2, 3):
-        run = first_half(load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot))
-        ratios.append(_configuration_rmse_m(run, nameless) / _configuration_rmse_m(run))
-    assert np.mean(ratios) < 1.3
+    run = first_half(load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot))
+    assert _configuration_rmse_m(run, nameless) < limit * _configuration_rmse_m(run)
 
 
 def first_half(run):

@@ -60,7 +60,6 @@ def _summary(output, name):
 
 def test_demo_converges_and_leaves_figures_and_a_recording(tmp_path):
     (tmp_path / 'run_1').mkdir()
-    # Faster, a moment in which the observer does not run is longer than its late_limit.
     code, output = run_demo(tmp_path, '--real-time-factor', '10', '--duration', '70')
     assert code == 0, output
     assert _summary(output, 'log10 L at 60 s') < -10.0
