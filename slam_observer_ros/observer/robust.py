@@ -18,6 +18,9 @@ from slam_observer_ros.geometry.matrices import (
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 
+AT_ONCE = 32
+"""Points that are used at once; each block of so many is judged by what those before it left."""
+
 REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
 

@@ -56,6 +56,18 @@ class SymmetricMatrix:
             self._storage = roomy
         self._size = size
 
+    def insert_zeros(self, at: int, count: int) -> None:
+        """Insert rows and columns before number ``at``."""
+        before, end = self.values, self._size + count
+        self._storage, self._size = np.zeros((end, end)), end
+        for rows, to_rows in ((slice(at), slice(at)), (slice(at, None), slice(at + count, end))):
+            self._storage[to_rows, :at] = before[rows, :at]
+            self._storage[to_rows, at + count :] = before[rows, at:]
+
+    def among(self, numbers: IntArray) -> FloatArray:
+        """Return the entries (q, q) of the ``numbers`` (q,) of rows and columns."""
+        return self._storage.take(numbers, axis=0).take(numbers, axis=1)
+
     def subtract_square(self, W: FloatArray) -> None:
         """Subtract Wᵀ W for W (q, N)."""
         subtract_square(self._storage, self._size, self._widened(W))

@@ -28,7 +28,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Seen,
 )
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
-from slam_observer_ros.observer.riccati.riccati import AT_ONCE
+from slam_observer_ros.observer.robust import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.motion_noise import Factors
 from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory

@@ -12,7 +12,7 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.settings.estimator_settings import Settings
 

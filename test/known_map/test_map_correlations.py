@@ -29,7 +29,7 @@ from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import SeenPoints
-from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings

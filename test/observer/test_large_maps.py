@@ -25,7 +25,7 @@ from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
-from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize, CHECK_INTERVAL
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize, CHECK_INTERVAL
 from slam_observer_ros.observer.riccati.following_landmarks import REFERENCE_SHIFT_M
 from slam_observer_ros.observer.riccati.panel_matrix import PanelMatrix
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains

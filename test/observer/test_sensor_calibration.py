@@ -17,7 +17,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.runs.health import of_mounting
 from slam_observer_ros.sensor_models import calibration as calibrations

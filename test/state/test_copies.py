@@ -13,7 +13,7 @@ import pytest
 from slam_observer_ros.common.types import LandmarkColumns
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.settings.estimator_settings import Settings
 

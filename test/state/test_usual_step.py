@@ -14,7 +14,7 @@ from slam_observer_ros.association.interpretations import as_its_ids_say
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.observer import core
-from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import match

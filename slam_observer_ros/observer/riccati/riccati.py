@@ -28,22 +28,17 @@ from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.observer.residuals import Residuals, SeenPoints
-from slam_observer_ros.observer.riccati.compressed_covariance import (
-    BlockSize,
-    CompressedCovariance,
-)
+from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
+from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
-from slam_observer_ros.observer.robust import observation_weights
+from slam_observer_ros.observer.robust import AT_ONCE, observation_weights
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-AT_ONCE = 32
-"""Points that are used at once; each block of so many is judged by what those before it left."""
 
 MERGER_ROUNDS = 4
 """How often a merger is linearised; the last times it hardly changes."""
