@@ -20,7 +20,8 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.runs.health import of_mounting
-from slam_observer_ros.sensor_models import sensing, sensor_calibration
+from slam_observer_ros.sensor_models import calibration as calibrations
+from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.matching import match, sensitivity
@@ -147,7 +148,7 @@ def test_what_is_off_is_found_within_its_uncertainty(settings, relinearization_i
     estimator, plain = (
         estimate(world, changed) for changed in (settings, replace(settings, **WITHOUT_ESTIMATES))
     )
-    truth = dict(zip(sensor_calibration.NAMES, [*TURNED, *SHIFTED, LONGER], strict=True))
+    truth = dict(zip(calibrations.SENSOR_NAMES, [*TURNED, *SHIFTED, LONGER], strict=True))
     for part in estimator.calibration:
         assert abs(part.value - truth[part.name]) < 3.5 * part.deviation
         assert part.deviation < part.stated
@@ -287,7 +288,7 @@ def test_in_a_surveyed_map_it_is_found_fast(settings, mode):
     for event in world.events:
         estimator.add(event)
     estimator.flush()
-    truth = dict(zip(sensor_calibration.NAMES, [*TURNED, *SHIFTED, LONGER], strict=True))
+    truth = dict(zip(calibrations.SENSOR_NAMES, [*TURNED, *SHIFTED, LONGER], strict=True))
     for part in estimator.calibration:
         assert abs(part.value - truth[part.name]) < 3.5 * part.deviation
         assert part.deviation < 0.25 * part.stated
@@ -330,6 +331,6 @@ def test_what_was_found_is_said_as_what_to_set(name, value, text):
     assert said == text or text in said != ''
 
 
-UNITS = dict(zip(sensor_calibration.NAMES, sensor_calibration.UNITS, strict=True)) | {
+UNITS = dict(zip(calibrations.SENSOR_NAMES, calibrations.SENSOR_UNITS, strict=True)) | {
     'linear_scale_x': ''
 }
