@@ -317,6 +317,7 @@ class Hypotheses:
         state = hypothesis.state
         if taken.outcome is not None:
             hypothesis.cost = taken.cost
+            hypothesis.verdicts = noted(hypothesis.verdicts, state, taken, event)
             return _Child(hypothesis, taken.event, taken.outcome)
         state.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
         outcome = step(state, match(state, taken.event))

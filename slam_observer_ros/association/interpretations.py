@@ -142,12 +142,18 @@ Verdicts = dict[int, tuple[FloatArray, bool]]
 def noted(
     verdicts: Verdicts, state: State, taken: Interpretation, event: ObservationEvent
 ) -> Verdicts:
-    """Return the verdicts after an observation that was taken as interpreted."""
-    if not len(taken.suspects):
+    """Return the verdicts after an observation that was taken as interpreted.
+
+    Of a landmark that was forgotten there is none.
+    """
+    if not (verdicts or len(taken.suspects)):
         return verdicts
     points, believed = positions(state, event)[0], np.isin(event.ids, taken.event.ids)
     suspects = np.flatnonzero(np.isin(event.ids, taken.suspects)).tolist()
-    return verdicts | {int(event.ids[i]): (points[i], bool(believed[i])) for i in suspects}
+    judged = verdicts | {int(event.ids[i]): (points[i], bool(believed[i])) for i in suspects}
+    ids = np.array(list(judged), dtype=np.int64)
+    forgotten = ids[state.landmarks.rows_of(ids) < 0].tolist()
+    return {landmark_id: judged[landmark_id] for landmark_id in judged.keys() - {*forgotten}}
 
 
 def consistent(

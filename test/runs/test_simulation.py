@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -167,6 +167,7 @@ def test_only_landmarks_in_view_and_range_are_seen(angle_deg: float, range_m: fl
         points = se3.transform(se3.inverse(pose), simulation.world_points(0))
         distances = np.linalg.norm(points, axis=-1)
         angles = np.degrees(np.arccos(points[:, 0] / distances))
+        assume(np.abs(angles - angle_deg / 2.0).min() > 1e-9)  # on the edge rounding decides
         expected = (distances <= range_m) & (angles <= angle_deg / 2.0)
         assert_array_equal(observation.ids, np.flatnonzero(expected))
 
