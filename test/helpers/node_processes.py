@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import gc
 import json
 from pathlib import Path
 import re
@@ -216,13 +217,15 @@ def reason_of_refusal(make_node: Callable[[], Node], *arguments: str, **paramete
         args=['--ros-args', *_options(parameters), *arguments],
         signal_handler_options=SignalHandlerOptions.NO,
     )
+    reason = None
     try:
         make_node()
     except REFUSALS as error:
-        return _reason(error)
-    finally:
-        rclpy.shutdown()
-    raise AssertionError('the node has not refused it')
+        reason = _reason(error)
+    gc.collect()  # what was made of the node, as long as there is ROS
+    rclpy.shutdown()
+    assert reason is not None, 'the node has not refused it'
+    return reason
 
 
 def _options(parameters: dict[str, object]) -> list[str]:
