@@ -840,18 +840,6 @@ static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen 
     return 1;
 }
 
-/* [-hat(y), I] on the estimated axes, (k, p) of rows ``stride`` long. */
-static void output_matrix(const Estimate *x, const double y[3], double *C, long stride) {
-    double K[9];
-    hat(y, K);
-    for (int b = 0; b < x->k; b++) {
-        for (int s = 0; s < x->turns; s++)
-            C[b * stride + s] = -K[3 * b + x->pose + s];
-        for (int s = x->turns; s < x->p; s++)
-            C[b * stride + s] = s - x->turns == b ? 1.0 : 0.0;
-    }
-}
-
 static long column_of(const Estimate *x, const Residuals *res, long entry) {
     return x->first + x->k * (long)res->rows[entry / x->k] + entry % x->k;
 }
@@ -877,7 +865,7 @@ static void fill_predicted(const Estimate *x, const Observed *out, Residuals *re
         for (int b = 0; b < 3; b++)
             middle[b] = 0.5 * out->r[3 * i + b];
         memset(C, 0, (size_t)(res->k * q) * sizeof(double));
-        output_matrix(x, middle, C, q);
+        output_matrix(middle, x->p, C, q);
         for (int b = 0; b < res->k && res->has_sensor; b++)
             memcpy(C + b * q + x->p, res->D + (res->k * i + b) * x->c,
                    (size_t)x->c * sizeof(double));
@@ -1043,7 +1031,7 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
             double middle[3];
             for (int b = 0; b < 3; b++)
                 middle[b] = res->points[3 * (at[i] / k) + b] + 0.5 * out->r[3 * (at[i] / k) + b];
-            output_matrix(x, middle, Y + i * p, p);
+            output_matrix(middle, p, Y + i * p, p);
         }
         for (long i = 0; i < M; i++) {
             double half[6] = {0.0};

@@ -23,6 +23,20 @@ static inline void hat(const double w[3], double K[9]) { /* (7)  K v = w x v */
     K[6] = -w[1], K[7] = w[0];
 }
 
+/* C, [-hat(y), I] on the d axes that are estimated, of rows ``stride`` long: how a pose error moves
+ * a point at y. In the plane it is 2 x 3, in space 3 x 6. */
+static inline void output_matrix(const double y[3], long d, double *C, long stride) {
+    long k = d == 3 ? 2 : 3, turns = d - k, pose = d == 3 ? 2 : 0;
+    double K[9];
+    hat(y, K);
+    for (long b = 0; b < k; b++) {
+        for (long s = 0; s < turns; s++)
+            C[b * stride + s] = -K[3 * b + pose + s];
+        for (long s = turns; s < d; s++)
+            C[b * stride + s] = s - turns == b ? 1.0 : 0.0;
+    }
+}
+
 static inline void times(const double A[9], const double B[9], double C[9]) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)

@@ -182,18 +182,6 @@ static void normal(const double *J, const double *W, const double *e, long k, lo
         }
 }
 
-/* C (k x d), [-hat(y), I] on the axes that are estimated: how a pose error moves a point at y. */
-static void output_matrix(const double y[3], long d, double *C) {
-    if (d == 3) {
-        double planar[6] = {-y[1], 1.0, 0.0, y[0], 0.0, 1.0};
-        memcpy(C, planar, sizeof planar);
-    } else {
-        double spatial[18] = {0.0, y[2], -y[1], 1.0, 0.0,  0.0,   -y[2], 0.0, y[0],
-                              0.0, 1.0,  0.0,   y[1], -y[0], 0.0, 0.0,   0.0, 1.0};
-        memcpy(C, spatial, sizeof spatial);
-    }
-}
-
 /* --------------------------------------------------------- linearise: the prior (prior.py), … */
 
 /* Rows b -> J' b, J = [[J_eta, 0, 0], [0, I, 0], [-C, 0, R' of each point]]; ``top``: d width.
@@ -257,7 +245,7 @@ static void prior_error(const Equations *eq, const Prior *prior, const Solution 
         if (prior->is_relative) {
             seen_from(&before, prior->points + 3 * m, then);
             seen_from(&now, at->points + 3 * m, y);
-            output_matrix(y, d, C + eq->k * d * m);
+            output_matrix(y, d, C + eq->k * d * m, d);
         }
         for (long t = 0; t < eq->k; t++)
             e[d + eq->c + eq->k * m + t] = y[t] - then[t];
@@ -389,7 +377,7 @@ static void point_error(const Equations *eq, const Seen *seen, const Solution *a
     double predicted[3], y[3], C[18], D[21];
     Pose pose = pose_of(at->poses + 16 * eq->poses[m]);
     seen_from(&pose, at->points + 3 * eq->landmarks[m], predicted);
-    output_matrix(predicted, d, C);
+    output_matrix(predicted, d, C, d);
     memcpy(y, seen->points + 3 * m, sizeof y);
     memset(J, 0, (size_t)(k * q) * sizeof(double));
     if (seen->sensors != NULL)
