@@ -238,8 +238,10 @@ class Gains(ABC):
 
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks, if it is known."""
-        return None
+        return None if self.errors is None else self.errors.joint_covariance(rows)
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
-        return np.zeros(len(residuals.r))
+        return (
+            np.zeros(len(residuals.r)) if self.errors is None else self.errors.distances(residuals)
+        )

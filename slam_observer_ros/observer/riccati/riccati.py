@@ -259,14 +259,6 @@ class RiccatiGains(OrientationGains):
         """(c,) variances of what is estimated of the calibration."""
         return self.joint.calibration_variances
 
-    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
-        """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
-        return self.errors.joint_covariance(rows)
-
-    def distances(self, residuals: Residuals) -> FloatArray:
-        """Return the Mahalanobis distance (m,) of each residual."""
-        return self.errors.distances(residuals)
-
     def _compress_if_large(self, added: int) -> None:
         """Go on with a covariance for many landmarks, unless they move or P has none of them."""
         # Tags count by what is estimated of them: relinearising ends there, too.
