@@ -28,6 +28,7 @@ from slam_observer_ros.cli.console import (
 )
 from slam_observer_ros.cli.held_out import (
     add_material_options,
+    check_improvement,
     check_seen,
     HELD_OUT_SHARE,
     judge,
@@ -46,7 +47,6 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
 from slam_observer_ros.cli.replay_run import select_inputs
-from slam_observer_ros.common.errors import IncompleteError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -116,8 +116,7 @@ def run(args: argparse.Namespace) -> None:
             material.likelihood(request.settings), trained_on.likelihood(stated.settings)
         )
     _print(args, material, found, stated, gain, verdict)
-    if verdict.objection:
-        raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
+    check_improvement(verdict)
     if args.out is not None:
         _write(args, given, material, stated, gain, verdict)
 

@@ -14,7 +14,7 @@ from slam_observer_ros.cli.options import add_settings_options, named_path
 from slam_observer_ros.cli.outputs import add_force_option
 from slam_observer_ros.cli.replay_request import add_input_options, ReplayRequest
 from slam_observer_ros.cli.replay_run import select_inputs
-from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
@@ -236,6 +236,12 @@ def check_seen(judged: Iterable[Judged]) -> None:
     """Raise a UsageError if there is nothing to judge in what was held out."""
     if not all(len(one.likelihood.stamps_ns) for one in judged):
         raise UsageError('nothing is seen twice in what is held out')
+
+
+def check_improvement(verdict: Verdict) -> None:
+    """Raise an IncompleteError if what was held out does not confirm what was found."""
+    if verdict.objection:
+        raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
 
 
 def add_material_options(

@@ -11,6 +11,7 @@ from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
 from slam_observer_ros.cli.held_out import (
     add_material_options,
+    check_improvement,
     check_seen,
     HELD_OUT_SHARE,
     judge,
@@ -36,7 +37,7 @@ from slam_observer_ros.cli.outputs import (
     check_outputs,
 )
 from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
-from slam_observer_ros.common.errors import IncompleteError, UsageError
+from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import write_found
@@ -84,8 +85,7 @@ def run(args: argparse.Namespace) -> None:
     tuned = _rounded(scaled(settings, kinds, found.log_factors.tolist()), kinds)
     verdict = _verdict(request, args.hold_out, trained_on, tuned)
     _print(args, settings, tuned, kinds, found, verdict)
-    if verdict.objection:
-        raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
+    check_improvement(verdict)
     if args.out is not None:
         head = _head(trained_on, args.hold_out, verdict)
         write_found(args.out, head, given.values, _groups(tuned, kinds, found))
