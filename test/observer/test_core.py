@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 import pytest
+from rounding import off_by
 import sanitized
 import step_arguments
 
@@ -36,8 +37,7 @@ def assert_same(one, other, what):
                 continue
             finite = np.isfinite(b)
             np.testing.assert_array_equal(np.isfinite(a), finite, err_msg=name)
-            scale = max(float(np.abs(b[finite]).max(initial=0.0)), 1e-6)
-            off = float(np.abs(a[finite] - b[finite]).max(initial=0.0)) / scale
+            off = off_by(a[finite], b[finite], 1e-6)
             assert off <= ROUNDING, f'{what}: {name} is off by {off:.1e}'
 
 

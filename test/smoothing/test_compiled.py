@@ -5,6 +5,7 @@ from pathlib import Path
 import newton_arguments
 import numpy as np
 import pytest
+from rounding import off_by
 import sanitized
 
 from slam_observer_ros.smoothing import bordered_chain, gauss_newton
@@ -23,8 +24,7 @@ def fixture_compiled():
 
 def assert_same(one, other, tolerance, what):
     for name, a, b in zip(type(one)._fields, one, other, strict=True):
-        scale = max(float(np.abs(b).max(initial=0.0)), 1e-6)
-        off = float(np.abs(a - b).max(initial=0.0)) / scale
+        off = off_by(a, b, 1e-6)
         assert off <= tolerance, f'{what}: {name} is off by {off:.1e}'
 
 
