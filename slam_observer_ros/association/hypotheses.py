@@ -253,11 +253,9 @@ class Hypotheses:
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        if len(self._all) == 1:
-            outcome = usual.observe(self.best, event) or in_parts.observe(self.best, event)
-            if outcome is not None:
-                self._some_have_ids = True
-                return outcome
+        if len(self._all) == 1 and (outcome := in_parts.observe(self.best, event)) is not None:
+            self._some_have_ids = True
+            return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         if self.best.errors is None:
@@ -314,13 +312,10 @@ class Hypotheses:
         self, hypothesis: Hypothesis, taken: Interpretation, event: ObservationEvent
     ) -> _Child:
         """Let a hypothesis use an observation as one interpretation has it."""
-        state = hypothesis.state
-        if taken.outcome is not None:
-            hypothesis.cost = taken.cost
-            hypothesis.verdicts = noted(hypothesis.verdicts, state, taken, event)
-            return _Child(hypothesis, taken.event, taken.outcome)
-        state.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
-        outcome = step(state, match(state, taken.event))
+        state, outcome = hypothesis.state, taken.outcome
+        if outcome is None:
+            state.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
+            outcome = step(state, match(state, taken.event))
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
@@ -341,25 +336,40 @@ class Hypotheses:
         new_cost = self._new_landmarks.cost(gate_cost)
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf  # the most that is worth following, the cheapest so far being known
-        is_alone = len(self._all) == 1
         for number, hypothesis in enumerate(self._all):
-            state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
-            seen = corrected(state, event)
-            used = None
-            if not is_alone:
-                used = usual.observe(state, event, True) or in_parts.observe(state, event, True)
-            meanings = [] if used is None else [as_its_ids_say(state, seen, used)]
-            found = meanings or interpretations(
-                state, index, seen, match(state, seen), new_ids, new_cost, worst - cost, is_alone
-            )
-            if not is_alone:
-                before = hypothesis.verdicts
-                found = consistent(before, state, found, event) or found * (number == 0)
-            for taken in found:
+            cost = hypothesis.cost
+            for taken in self._meanings(hypothesis, event, new_ids, new_cost, worst - cost):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
         return [(number, taken) for number, taken in possible if taken.cost <= worst]
+
+    def _meanings(
+        self,
+        hypothesis: Hypothesis,
+        event: ObservationEvent,
+        new_ids: IntArray,
+        new_cost: float,
+        budget: float,
+    ) -> list[Interpretation]:
+        """Return what an observation may mean to a hypothesis: :func:`.interpretations`.
+
+        Of several, one that contradicts what it said before is given up, unless it is the best.
+        """
+        state, is_alone = hypothesis.state, len(self._all) == 1
+        seen = corrected(state, event)
+        used = None if is_alone else in_parts.observe(state, event, is_weighed=True)
+        if used is not None:
+            found = [as_its_ids_say(state, seen, used)]
+        else:
+            matched, index = match(state, seen), hypothesis.index
+            found = interpretations(
+                state, index, seen, matched, new_ids, new_cost, budget, is_alone
+            )
+        if is_alone:
+            return found
+        agreeing = consistent(hypothesis.verdicts, state, found, event)
+        return found if not agreeing and hypothesis is self._all[0] else agreeing
 
     def _new_ids(self, m: int) -> IntArray:
         """Return ids (m,) that no landmark of any hypothesis has, nor one of a loaded map."""

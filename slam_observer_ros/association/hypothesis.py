@@ -9,7 +9,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, field
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -234,6 +234,10 @@ class Visibility:
         return is_unexpected
 
 
+Verdicts: TypeAlias = dict[int, tuple[FloatArray, bool]]
+"""By id, where suspects were (3,) when they were seen last, and whether they were believed."""
+
+
 @dataclass(slots=True, eq=False)
 class Hypothesis:
     """A state, and what only points without an id need of it."""
@@ -242,8 +246,7 @@ class Hypothesis:
     visibility: Visibility  # what is in view of a sensor that gives no ids
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
     cost: float = 0.0  # −2 ln of its likelihood, over that of the most likely one
-    # By id, where suspects were when they were seen last, and whether they were believed.
-    verdicts: dict[int, tuple[FloatArray, bool]] = field(default_factory=dict)
+    verdicts: Verdicts = field(default_factory=dict)
 
     @classmethod
     def of(cls, state: State) -> Hypothesis:

@@ -24,7 +24,7 @@ from slam_observer_ros.association.costs import (
     rejection_cost,
     SLIP_COST,
 )
-from slam_observer_ros.association.hypothesis import LandmarkIndex
+from slam_observer_ros.association.hypothesis import LandmarkIndex, Verdicts
 from slam_observer_ros.association.joint_compatibility import joint_cost
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
@@ -133,10 +133,6 @@ def _without(
         cost - saved,
         disbelieved=event.select(np.isin(event.ids, unconfirmed_ids)),
     )
-
-
-Verdicts = dict[int, tuple[FloatArray, bool]]
-"""By id, where suspects were (3,) when they were seen last, and whether they were believed."""
 
 
 def noted(

@@ -1,6 +1,7 @@
-"""Observations of which the usual step can use a part: the rest is rejected, or of new landmarks.
+"""Observations that the usual step uses: nearly always whole, else in parts.
 
-That is counted and entered over the same arrays, as :mod:`.step` does it.
+What is rejected, or of new landmarks, is counted and entered over the same arrays afterwards, as
+:mod:`.step` does it.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, IntArray
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.observer.step import REJECTS
+from slam_observer_ros.observer.step import DONE, REJECTS
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import (
     corrected,
@@ -25,17 +26,46 @@ from slam_observer_ros.state.usual import Corrected, NO_IDS, Outcome
 
 
 def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
-    """As :func:`.usual.observe`; None, with nothing changed, where that is not possible either."""
+    """Let a state use an observation (28)–(31) made at its instant; ``is_weighed`` as to correct.
+
+    Return None, with nothing changed, where the usual step is not possible.
+    """
     rows = state.landmarks.rows_of(event.ids)
     known = rows >= 0
-    if not usual.takes(state, event) or not _may_enter(state, event.ids[~known]):
+    if not usual.takes(state, event):
+        return None
+    if not len(rows) or np.count_nonzero(known) < len(rows):
+        return _in_parts(state, event, rows, known, None, is_weighed)
+    of_all = usual.correct(state, event, rows, is_weighed)
+    if of_all is None:
+        return None
+    if of_all.status == DONE:  # as nearly always
+        return usual.whole(state, event, of_all)
+    return _in_parts(state, event, rows, known, of_all, is_weighed)
+
+
+def _in_parts(
+    state: State,
+    event: ObservationEvent,
+    rows: IntArray,
+    known: BoolArray,
+    of_all: Corrected | None,
+    is_weighed: bool,
+) -> Outcome | None:
+    """Use the points of ``known`` (m,) landmarks, as far as they are not rejected.
+
+    ``of_all`` is what the kernel made of them, if it was asked already.
+    """
+    if not _may_enter(state, event.ids[~known]):
         return None
     shown, used = corrected(state, event), known.copy()  # by the calibration before the step
     new = shown.select(~known)
     noise = point_covariances(state, new, rows[~known])
-    of_all = of_used = None
+    of_used = None
     if np.count_nonzero(known):
-        of_all = of_used = usual.correct(state, event.select(known), rows[known], is_weighed)
+        if of_all is None:
+            of_all = usual.correct(state, event.select(known), rows[known], is_weighed)
+        of_used = of_all
         if of_all is not None and of_all.status == REJECTS:
             used[known] = of_all.out.weights > 0.0
             if not _may_leave_out(state, rows[known], ~used[known]):
@@ -73,10 +103,9 @@ def _may_leave_out(state: State, rows: IntArray, rejected: BoolArray) -> bool:
 
     They are ``rejected`` once more then.
     """
-    table, some = state.landmarks, rows[rejected]
-    needed = np.minimum(table.counts[some] + 1, state.settings.max_rejections)
-    are_in_doubt = table.rejections[some] + 1 >= needed
-    return not np.count_nonzero(are_in_doubt) and not is_contradiction(rejected)
+    most = state.settings.max_rejections
+    in_doubt = state.landmarks.in_doubt(rows[rejected], most, further=1)
+    return not np.count_nonzero(in_doubt) and not is_contradiction(rejected)
 
 
 def _outcome(

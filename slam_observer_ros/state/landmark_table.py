@@ -169,13 +169,14 @@ class LandmarkTable(LandmarkColumns):
         shifts_m = np.linalg.norm(points - self.rejected_at[rows], axis=1)
         return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
 
-    def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
+    def in_doubt(self, rows: IntArray, max_rejections: int, further: int = 0) -> BoolArray:
         """Return which of the rows (m,) have been rejected too often to be trusted.
 
         That is ``max_rejections`` times, or once more than they were seen: what contradicts a
-        landmark that was seen once or twice may itself be the outlier.
+        landmark that was seen once or twice may itself be the outlier. Each of them may be about
+        to be rejected ``further`` times.
         """
-        rejections = self.rejections.take(rows, mode='wrap')  # −1 for a new one as well
+        rejections = self.rejections.take(rows, mode='wrap') + further  # −1 for a new one as well
         if not np.count_nonzero(rejections):  # as nearly always
             return np.zeros(len(rows), dtype=np.bool_)
         needed = np.minimum(self.counts[rows] + 1, max_rejections)

@@ -151,24 +151,15 @@ class Corrected(NamedTuple):
     factors: Factors | None  # what was learnt of the noise of the motion
 
 
-def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
-    """Let a state use an observation (28)–(31) made at its instant.
-
-    ``is_weighed`` asks what was expected of it, too.
-    """
-    rows = state.landmarks.rows_of(event.ids)
-    if np.count_nonzero(rows < 0) or not takes(state, event):
-        return None
-    corrected = correct(state, event, rows, is_weighed)
-    if corrected is None or corrected.status != step.DONE:
-        return None
-    past, out, m = state.relinearisation, corrected.out, len(rows)
+def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Outcome:
+    """Keep a keyframe of an observation all of which has corrected a state; return its outcome."""
+    past, out = state.relinearisation, corrected.out
     if past is not None and past.is_active:
         past.add(keyframe(state, event, corrected), in_doubt=False)
     return Outcome(
         event.ids,
         out.r,
-        np.zeros(m, dtype=np.bool_),
+        np.zeros(len(event.ids), dtype=np.bool_),
         NO_IDS,
         innovation(state, out),
         weighed(state, out),
@@ -200,6 +191,7 @@ def correct(
     """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe of it.
 
     Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
+    ``is_weighed`` asks what was expected of the points, too.
     """
     m, k, joint = len(rows), state.axes.point, state.joint
     if joint is None or not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
