@@ -19,10 +19,11 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3, slam_group, so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, with_blocks
 from slam_observer_ros.geometry.sensor_mounting import sensitivity as sensor_sensitivity
+from slam_observer_ros.observer.chart import slam_exp
 from slam_observer_ros.observer.flat_arrays import (
     Advanced,
     Estimate,
@@ -285,7 +286,7 @@ def observe(
         return UNUSUAL
     # (28)  X̂ ← exp(−K r) · X̂:  Â ← exp(ε) Â,  ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i
     axes = residuals.axes
-    X = slam_group.exp(axes.full_pose(dx[: axes.p]), axes.full_points(dx[x.first :]))
+    X = slam_exp(axes.full_pose(dx[: axes.p]), axes.full_points(dx[x.first :]))
     R_D = X.A[:3, :3]
     out.A[:] = X.A.dot(x.A)
     x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))

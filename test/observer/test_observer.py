@@ -6,10 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+import slam_group
+from slam_group import SlamElement, TotalState
 from strategies import generators, poses, rotations
 
-from slam_observer_ros.geometry import se3, slam_group
-from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.constant import (
     centroid_step,
     ConstantGains,
