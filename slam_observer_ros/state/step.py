@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observer.residuals import Residuals, SeenPoints
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
     corrected_again,
@@ -114,8 +114,7 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
         moved_to = event.select(far)
-        seen = SeenPoints(moved_to.points, noise[far], sensitivity(state, moved_to))
-        state.relocate(rows[far], seen)
+        state.relocate(rows[far], moved_to.points, noise[far], sensitivity(state, moved_to))
         state.landmarks.take_for_new(rows[far], event.stamp_ns)
         take_over_orientations(state, moved_to, rows[far])
     return event.ids[moved]
