@@ -17,7 +17,7 @@ from slam_observer_ros.observer.constant import (
     paper_step,
     safe_step,
 )
-from slam_observer_ros.observer.innovation import innovation, lyapunov, lyapunov_rate
+from slam_observer_ros.observer.continuous_time import innovation, lyapunov, lyapunov_rate
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import SeenPoints
