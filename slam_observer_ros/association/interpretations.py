@@ -31,7 +31,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.robust import are_far, far_from_the_others
+from slam_observer_ros.observer.robust import accepted, are_far, far_from_the_others
 from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Outcome
@@ -183,7 +183,7 @@ def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
     residuals = matched.residuals
     sensor_distances = _sensor_distances(state, residuals)
-    if not np.count_nonzero(sensor_distances > state.settings.rejection_threshold):
+    if accepted(sensor_distances, state.settings.rejection_threshold).all():
         return False  # by all of S they are no further off
     some_are_suspect = bool(_suspects(state, residuals, sensor_distances).any())
     return some_are_suspect or is_contradiction(_are_rejected(state, residuals))
@@ -246,7 +246,8 @@ def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
 
 def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
     """Return which points (m,) the gate rejects."""
-    return np.asarray(state.gains.distances(residuals) > state.settings.rejection_threshold)
+    gate = state.settings.rejection_threshold
+    return ~accepted(state.gains.distances(residuals), gate)
 
 
 def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:

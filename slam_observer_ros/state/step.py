@@ -7,6 +7,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
@@ -111,7 +112,8 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     event = corrected_again(state, event)
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
-    far = state.gains.distances(residuals) > state.settings.rejection_threshold
+    gate = state.settings.rejection_threshold
+    far = ~accepted(state.gains.distances(residuals), gate)
     moved = far & (state.landmarks.counts[rows] >= state.settings.confirmations)
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():

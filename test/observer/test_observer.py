@@ -6,17 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+import slam_group
+from slam_group import SlamElement, TotalState
 from strategies import generators, poses, rotations
 
-from slam_observer_ros.geometry import se3, slam_group
-from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.constant import (
     centroid_step,
     ConstantGains,
     paper_step,
     safe_step,
 )
-from slam_observer_ros.observer.innovation import innovation, lyapunov, lyapunov_rate
+from slam_observer_ros.observer.continuous_time import innovation, lyapunov, lyapunov_rate
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.settings.estimator_settings import Settings

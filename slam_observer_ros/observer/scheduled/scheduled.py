@@ -40,7 +40,7 @@ from slam_observer_ros.observer.gains import Gains, OF_CONSTANT_GAINS, OF_JOINT_
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.robust import huber_weights, REWEIGHTINGS
+from slam_observer_ros.observer.robust import accepted, huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled.core import Core, regression
 from slam_observer_ros.sensor_models.calibration import without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion
@@ -108,7 +108,8 @@ class ScheduledGains(Gains):
         rows = residuals.rows
         F, N, _ = self._postponed.now(rows)
         H = self._output_matrix(residuals.landmarks) - F
-        passed = self._distances(residuals, F, N) <= self._settings.rejection_threshold
+        gate = self._settings.rejection_threshold
+        passed = accepted(self._distances(residuals, F, N), gate)
         step = self._reweighted_step(residuals, H, N, passed)
         # (31)  δ_i; F_i and N_i after it, where a motion of everything remains one.
         Delta, gain_k = step.Delta, step.gain_k
