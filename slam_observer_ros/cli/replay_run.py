@@ -22,8 +22,8 @@ from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.input_health import of_use
-from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import Replay, replay
+from slam_observer_ros.runs.reported_run import NisTally, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
