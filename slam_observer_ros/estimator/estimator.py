@@ -39,8 +39,8 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.known_map.merging import map_of
+from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.observer.designs import make_gains
-from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
 from slam_observer_ros.state.state import State

@@ -34,6 +34,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Seen,
 )
 from slam_observer_ros.observer.robust import (
+    accepted,
     are_far,
     far_from_the_others,
     huber_weights,
@@ -273,8 +274,8 @@ def observe(
     learnt = None if factors is None else _learnt(factors, residuals, judged.S, limits.gate)
     if factors is not None and learnt is None:
         return UNUSUAL
-    if judged.distances is not None and np.count_nonzero(judged.distances > limits.gate):
-        out.weights[:] = judged.distances <= limits.gate
+    if judged.distances is not None and not accepted(judged.distances, limits.gate).all():
+        out.weights[:] = accepted(judged.distances, limits.gate)
         _take_over(factors, learnt)
         return REJECTS
     if limits.weighs_meanings and _may_be_something_else(residuals, judged, limits.gate):
@@ -427,7 +428,7 @@ def _learnt(
         squared, m = float(r.dot(solved[:, 0])), len(r) // k
         if squared <= gate**2:
             break
-        passed = mahalanobis(r.reshape(m, k), diagonal_blocks(S, k)) <= gate
+        passed = accepted(mahalanobis(r.reshape(m, k), diagonal_blocks(S, k)), gate)
         if not m < 2 * np.count_nonzero(passed) < 2 * m:
             break
         used = np.flatnonzero(np.repeat(passed, k))  # some few are left out

@@ -25,8 +25,7 @@ from slam_observer_ros.inputs.event_builder import (
     Measured,
     with_receive_time,
 )
-from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms, TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock
 from slam_observer_ros.messages.registry import BlockDecoder
 from slam_observer_ros.recording.contents import Arrivals, Contents

@@ -33,7 +33,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.designs import make_gains
-from slam_observer_ros.recording.mrclam import load_mrclam
+from slam_observer_ros.recording.data_sets import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file

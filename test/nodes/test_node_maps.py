@@ -25,7 +25,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import diagonal_blocks
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.estimate_messages import StateMessages, uncertain_pose
 from slam_observer_ros.messages.poses import pose_matrices

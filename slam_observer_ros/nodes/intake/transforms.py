@@ -11,11 +11,10 @@ from rclpy.subscription import Subscription
 from slam_observer_ros.common.errors import MessageError, TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import insert_transforms
-from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
+from slam_observer_ros.inputs.frames import ALWAYS_NS, insert_transforms, TransformBuffer
 from slam_observer_ros.messages.poses import decode_transforms
+from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.input_topic import take
-from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
