@@ -173,8 +173,9 @@ def _check_localised(request: ReplayRequest, result: Replay, maps: Sequence[Land
 
 def _never_found(result: Replay, maps: Sequence[LandmarkMap]) -> str:
     estimator = result.estimator
-    if is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses):
-        return f'{estimator.localisation_problem}{_advice(result)}'
+    problem = estimator.localisation_problem
+    if problem and (is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)):
+        return f'{problem.what}{_advice(result)}'
     least = 'two' if estimator.settings.two_d_mode else 'three'
     ids = np.concatenate([known.ids for known in maps])
     named = ids[~is_automatic(ids)]
