@@ -82,14 +82,14 @@ def _replay(
         with _estimate_writer(records, recording, selected, inputs, map_frame) as writer:
             recorders = [noter for noter in (recorder, writer) if noter is not None]
             result = replay(events, settings, truth, maps or None, needs_poses, recorders)
-            use = list(of_use(recording, selected, inputs, result))
-            _check_used(request, use)
+            unused = list(of_use(recording, selected, inputs, result))
+            _check_used(request, unused)
             if maps:
                 _check_localised(request, result, maps)
             outcome = outcome_of(recording, selected, result, truth, recorder)
             if writer is not None:
                 writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
-        outcome = judged(outcome, recording, inputs, use, request.load_map)
+        outcome = judged(outcome, recording, inputs, unused, request.load_map)
     return with_smoothed(outcome) if request.smooth else outcome
 
 

@@ -127,11 +127,15 @@ def estimator_values(
     return values
 
 
-def of_estimate(estimator: Diagnosed) -> list[Finding]:
-    """Judge the velocity, its calibration and its noise, by the estimate alone."""
+def of_velocity(estimator: Diagnosed) -> list[Finding]:
+    """Judge whether velocities still come."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
+    return [found('stale_velocity')] if stale else []
+
+
+def of_estimate(estimator: Diagnosed) -> list[Finding]:
+    """Judge what is estimated of velocities and sensors, live and after a whole run alike."""
     return [
-        *([found('stale_velocity')] if stale else []),
         *of_calibration(estimator.calibration),
         *of_mounting(estimator.calibration),
         *of_noise(estimator.motion_factors),
@@ -290,7 +294,7 @@ def diagnostics(
     messages: OutgoingMessages, stamp_ns: int, estimator: Diagnosed, hardware_id: str
 ) -> Any:
     """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
-    findings = of_estimate(estimator)
+    findings = of_velocity(estimator) + of_estimate(estimator)
     warnings = [finding.what for finding in findings]
     values = estimator_values(estimator, estimator.dropped, findings)
     status = messages.make(

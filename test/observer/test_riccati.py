@@ -19,10 +19,11 @@ from random_runs import (
     random_step,
     residuals_of,
 )
+import slam_group
 from strategies import generators, poses
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, slam_group, so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer

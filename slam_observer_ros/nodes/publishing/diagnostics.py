@@ -23,6 +23,7 @@ from slam_observer_ros.runs.health import (
     of_left_out,
     of_rejections,
     of_stamps,
+    of_velocity,
 )
 
 SILENT_S = 2.0  # an input without messages for this long is a warning
@@ -158,7 +159,7 @@ class DiagnosticsPublisher:
         recent = sum(self._recent_counts, Counter())
         if recent['observed_point'] >= MIN_POINTS:
             findings += of_rejections(recent, 'seen lately ')
-        findings += of_estimate(self._estimator)
+        findings += of_velocity(self._estimator) + of_estimate(self._estimator)
         if not self._estimator.is_localised:
             findings.append(found('unknown_pose'))
             # Landmarks that came without an id have one that was given here.
