@@ -1306,5 +1306,5 @@ static struct PyModuleDef definition = {
 };
 
 PyMODINIT_FUNC PyInit__core(void) {
-    return PyModule_Create(&definition);
+    return make_module(&definition);
 }
