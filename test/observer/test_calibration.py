@@ -20,7 +20,13 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.runs.health import of_calibration
-from slam_observer_ros.sensor_models.calibration import Calibration, MIN_DELAY_S
+from slam_observer_ros.sensor_models import calibration as calibrations
+from slam_observer_ros.sensor_models.calibration import (
+    Calibration,
+    Entry,
+    MIN_DELAY_S,
+    OF_VELOCITY,
+)
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
@@ -409,6 +415,27 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
     for column, unit in enumerate(np.eye(calibration.count)):
         error = se3.log(path(h * unit)[-1] @ se3.inverse(nominal[-1]))[axes.pose] / h
         np.testing.assert_allclose(F[:, column], error, atol=1e-3 * dt_s * pieces)
+
+
+@pytest.mark.parametrize('gains', ['riccati', 'scheduled'])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_one_more_state_of_velocities_takes_two_parameters_and_a_row(
+    monkeypatch, gains, two_d_mode
+):
+    sideways, turning = 4, 2
+    row = Entry('side_slip', 'side_slip', None, 7 * sideways + turning, 'm/rad')
+    with_row = (*OF_VELOCITY[:-1], row, OF_VELOCITY[-1])
+    monkeypatch.setattr(calibrations, 'OF_VELOCITY', with_row)
+    monkeypatch.setattr(Settings, 'side_slip', 0.0, raising=False)
+    monkeypatch.setattr(Settings, 'side_slip_stddev', 0.2, raising=False)
+    settings = Settings(gains=gains, two_d_mode=two_d_mode, reorder_window=0.0)
+    slips = np.zeros((600, 6))
+    slips[:, sideways] = 0.1 * true_velocities(600, two_d_mode)[:, turning]
+    estimator = estimate(drive(settings, 30.0, bias=slips), settings)
+    (found,) = (part for part in estimator.calibration if part.name == 'side_slip')
+    assert found.unit == 'm/rad' and found.stated == 0.2
+    assert found.deviation < 0.05
+    assert abs(found.value - 0.1) < 3.0 * found.deviation
 
 
 def test_drift_lets_the_uncertainty_grow_with_time():
