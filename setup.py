@@ -1,10 +1,13 @@
 """Installation for pip and for colcon (ament_python)."""
 
 from glob import glob
+import runpy
 
 from setuptools import Extension, find_packages, setup
 
 PACKAGE = 'slam_observer_ros'
+
+COMPILED = runpy.run_path(f'{PACKAGE}/common/computing.py')
 
 ROS_RELEASES = ('jazzy', 'kilted')  # those whose wheels are on PyPI
 ROS_WHEELS = (
@@ -41,6 +44,7 @@ setup(
             f'{PACKAGE}.{folder}.{name}',
             [f'{PACKAGE}/{folder}/{name}.c'],
             depends=glob(f'{PACKAGE}/observer/_*.h'),
+            define_macros=[('SOURCES', COMPILED['digest_of_sources'](f'{folder}.{name}'))],
             extra_compile_args=['-O3', '-fno-math-errno'],
             optional=True,  # without a compiler numpy does the same
         )

@@ -18,7 +18,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, PLANAR, SPATIAL
 from slam_observer_ros.known_map.constellation import find_places
-from slam_observer_ros.known_map.distances import MappedLandmarks
+from slam_observer_ros.known_map.landmark_map import MappedLandmarks
 from slam_observer_ros.known_map.places import Anywhere, Constellation, Place
 
 ERROR_PROBABILITY = 1e-3

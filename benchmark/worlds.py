@@ -18,9 +18,8 @@ from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.recording.data_sets import load_mrclam, load_starry_night
 from slam_observer_ros.recording.graph_files import load_graph
-from slam_observer_ros.recording.mrclam import load_mrclam
-from slam_observer_ros.recording.starry_night import load_starry_night
 from slam_observer_ros.recording.writer import DataSet
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise

@@ -29,11 +29,11 @@ from rich.progress import Progress
 from robot_report import Interruption, report
 
 from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.common.signals import StopSignal
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.nodes.launch_setup import command_line, EXECUTABLE
-from slam_observer_ros.nodes.stop_signal import StopSignal
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PARAMS_FILE, PARAMS_OF_REFLECTORS = 'config/tags_on_tf.yaml', 'config/reflectors.yaml'

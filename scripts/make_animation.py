@@ -25,7 +25,7 @@ from slam_observer_ros.evaluation.drawing import PALE_BLUE, RED, STYLE
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.mrclam import load_mrclam
+from slam_observer_ros.recording.data_sets import load_mrclam
 from slam_observer_ros.recording.writer import DataSet
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file

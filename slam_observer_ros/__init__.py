@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from slam_observer_ros.common.computing import use_one_thread
     from slam_observer_ros.estimator.estimator import Estimator
     from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
     from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -20,6 +21,7 @@ __all__ = [
     'ObservationEvent',
     'Settings',
     'VelocityEvent',
+    'use_one_thread',
 ]
 
 _MODULES = {
@@ -29,6 +31,7 @@ _MODULES = {
     'ObservationEvent': 'events',
     'Settings': 'settings.estimator_settings',
     'VelocityEvent': 'events',
+    'use_one_thread': 'common.computing',
 }
 """Where the names are defined; none is imported before it is used, as scipy takes a while."""
 

@@ -38,6 +38,7 @@ from slam_observer_ros.geometry.matrices import (
 )
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.matching import sensitivity
 from slam_observer_ros.state.state import State
@@ -98,28 +99,42 @@ def find_assignments(
     fixed_cost = float(none_costs.sum() - unpaired_costs[np.unique(at)].sum())
     margin = 0.0 if certain.all() else pruning_cost(event.ids)
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
-    # Of the pairings that put the robot at one pose, the cheapest, which comes first.
-    scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
-    J = scale @ axes.output_matrix(seen.points)  # how a pose error moves the points, in σ
-
-    def moved(pairing: Pairing) -> FloatArray:
-        of_pose = PC[:, columns_of(pairing.chosen, axes.point)] @ (pairing.L.T @ pairing.z)
-        return np.asarray(J @ of_pose)
-
+    moves = _PoseMoves(state, seen, PC)
     # Nearly always each point may be of one landmark, and all together hardly move the robot.
     are_single = len(np.unique(at)) == len(np.unique(rows)) == len(at) > 0
     whole = search.all_pairs() if are_single else None
-    if whole is not None and _largest(moved(whole)) <= HARDLY_MOVED:
-        return [Assignment(_taken(m, at, rows), whole.cost + fixed_cost)]
-    assignments: list[Assignment] = []
-    moves: list[FloatArray] = []
-    for pairing in search.pairings():
-        move = moved(pairing)
-        if all(_largest(move - other) > RESOLUTION for other in moves):
-            taken = _taken(m, at[pairing.chosen], rows[pairing.chosen])
-            assignments.append(Assignment(taken, pairing.cost + fixed_cost))
-            moves.append(move)
-    return assignments
+    is_enough = whole is not None and _largest(moves.by(whole)) <= HARDLY_MOVED
+    pairings = [whole] if whole is not None and is_enough else moves.distinct(search.pairings())
+    return [
+        Assignment(_taken(m, at[each.chosen], rows[each.chosen]), each.cost + fixed_cost)
+        for each in pairings
+    ]
+
+
+class _PoseMoves:
+    """How far pairings move the robot, by how far it moves the points, in the sensor's σ."""
+
+    def __init__(self, state: State, seen: _Points, PC: FloatArray) -> None:
+        axes = state.axes
+        scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
+        self._J = scale @ axes.output_matrix(seen.points)  # points by a pose error
+        self._PC, self._k = PC, axes.point
+
+    def by(self, pairing: Pairing) -> FloatArray:
+        """Return how far (m, k) the points move by the correction that a pairing makes."""
+        of_pairs = self._PC[:, columns_of(pairing.chosen, self._k)]
+        return np.asarray(self._J @ (of_pairs @ (pairing.L.T @ pairing.z)))
+
+    def distinct(self, pairings: list[Pairing]) -> list[Pairing]:
+        """Return the first pairing of all that put the robot at one pose."""
+        distinct: list[Pairing] = []
+        moves: list[FloatArray] = []
+        for pairing in pairings:
+            move = self.by(pairing)
+            if all(_largest(move - other) > RESOLUTION for other in moves):
+                distinct.append(pairing)
+                moves.append(move)
+        return distinct
 
 
 def _taken(m: int, at: IntArray, rows: IntArray) -> IntArray:
@@ -156,7 +171,7 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     # Each pair passes the gate alone; a point keeps its nearest landmarks.
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
-    passes = distances[order] <= state.settings.rejection_threshold
+    passes = accepted(distances[order], state.settings.rejection_threshold)
     near = order[(rank < MAX_CANDIDATES) & passes]
     return at[near], rows[near]
 
@@ -171,7 +186,7 @@ def _are_held_back(
     """
     landmarks, rows, stamp_ns = state.landmarks, residuals.rows, seen.stamp_ns
     held_back = np.zeros(len(at), dtype=np.bool_)
-    passes = distances <= state.settings.rejection_threshold
+    passes = accepted(distances, state.settings.rejection_threshold)
     rivals = np.bincount(at[passes], minlength=len(seen.points))[at] if len(at) else at
     may_be = passes & (rivals >= MIN_LOOP) & landmarks.are_old(rows, stamp_ns)
     if not state.is_mapping or not may_be.any():

@@ -31,7 +31,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.robust import are_far, far_from_the_others
+from slam_observer_ros.observer.robust import accepted, are_far, far_from_the_others
 from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Outcome
@@ -55,6 +55,7 @@ class Interpretation:
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
+    matched: MatchedObservation | None = None  # with the landmarks of these ids, where it is so
     outcome: Outcome | None = None  # where the state has already used it so
 
 
@@ -92,7 +93,8 @@ def interpretations(
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
     else:
-        trusting, slipped = Interpretation(event, pairing_cost(state, m, residuals)), []
+        cost = pairing_cost(state, m, residuals)
+        trusting, slipped = Interpretation(event, cost, matched=matched), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
     without = [_without(ids, state, matched, trusting) for ids in doubted]
     return _of_suspects([trusting, *without, *slipped], suspects)
@@ -104,10 +106,11 @@ def _of_suspects(found: list[Interpretation], suspects: IntArray) -> list[Interp
 
 def as_its_ids_say(state: State, event: ObservationEvent, outcome: Outcome) -> Interpretation:
     """Return the only meaning of an observation that a state has used as usual."""
-    weighed, m = outcome.weighed, len(event.ids)
+    expected, m = outcome.expected, len(event.ids)
     cost = m * outlier_cost(state)
-    if weighed is not None:
-        cost = joint_cost(*weighed) + (m - len(weighed.r)) * outlier_cost(state)
+    if expected is not None:
+        paired_cost = joint_cost(expected.r, expected.S, expected.R)
+        cost = paired_cost + (m - len(expected.r)) * outlier_cost(state)
     return Interpretation(event, cost, outcome=outcome)
 
 
@@ -180,7 +183,7 @@ def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
     residuals = matched.residuals
     sensor_distances = _sensor_distances(state, residuals)
-    if not np.count_nonzero(sensor_distances > state.settings.rejection_threshold):
+    if accepted(sensor_distances, state.settings.rejection_threshold).all():
         return False  # by all of S they are no further off
     some_are_suspect = bool(_suspects(state, residuals, sensor_distances).any())
     return some_are_suspect or is_contradiction(_are_rejected(state, residuals))
@@ -209,14 +212,15 @@ def _rejected_or_slipped(
     cost, is_new_cause = rejection_cost(state, matched, rejected)
     accepted_cost = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
     after_slip = _after_slip(state, matched, event) if is_new_cause else None
+    rejecting = Interpretation(event, accepted_cost + cost, matched=matched)
     if after_slip is None:
-        return [Interpretation(event, accepted_cost + cost)]
+        return [rejecting]
     if state.was_contradicted:
-        return [Interpretation(event, accepted_cost + cost), after_slip]
+        return [rejecting, after_slip]
     as_outliers = accepted_cost + float(np.sum(rejected)) * outlier_cost(state)
     # A garbled message also explains points that happen to be where they should be.
     garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
-    return [Interpretation(event, garbled), after_slip]
+    return [replace(rejecting, cost=garbled), after_slip]
 
 
 def _after_slip(
@@ -228,11 +232,11 @@ def _after_slip(
         return None
     slipped = state.copy()
     cost = slip(slipped, matched)
-    residuals = match(slipped, event).residuals
-    if _are_rejected(slipped, residuals).any():
+    matched = match(slipped, event)
+    if _are_rejected(slipped, matched.residuals).any():
         return None
-    cost += SLIP_COST + pairing_cost(slipped, len(event.ids), residuals)
-    return Interpretation(event, cost, slipped)
+    cost += SLIP_COST + pairing_cost(slipped, len(event.ids), matched.residuals)
+    return Interpretation(event, cost, slipped, matched=matched)
 
 
 def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
@@ -242,7 +246,8 @@ def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
 
 def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
     """Return which points (m,) the gate rejects."""
-    return np.asarray(state.gains.distances(residuals) > state.settings.rejection_threshold)
+    gate = state.settings.rejection_threshold
+    return ~accepted(state.gains.distances(residuals), gate)
 
 
 def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:

@@ -19,6 +19,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import solve_symmetric, transpose
 from slam_observer_ros.geometry.se3 import rigid_alignment
+from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.state.matching import match, MatchedObservation, residuals_of
@@ -135,7 +136,8 @@ class RejectedLandmarks:
         known, settings = matched.known, state.settings
         if not len(known.ids):
             return False
-        if (state.gains.distances(matched.residuals) <= settings.rejection_threshold).any():
+        gate = settings.rejection_threshold
+        if accepted(state.gains.distances(matched.residuals), gate).any():
             self.clear()
             return False
         may_stray = settings.unknown_linear_motion or settings.unknown_angular_motion

@@ -11,8 +11,8 @@ import json
 import math
 import sys
 
+from slam_observer_ros.cli.console import completed_by
 from slam_observer_ros.cli.options import config_files, find_config, named, shipped_names
-from slam_observer_ros.cli.shell import completed_by
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.files import not_special
 from slam_observer_ros.settings.estimator_settings import Settings

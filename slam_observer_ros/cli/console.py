@@ -1,17 +1,21 @@
-"""What the command line says: results on standard output, messages and progress beside them."""
+"""What the command line says: results on standard output, messages and progress beside them.
+
+And what completes a word, if a shell asks for that.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 import logging
 import sys
 import threading
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TYPE_CHECKING, TypeVar
 
-from slam_observer_ros.cli.shell import leaving_at_once
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.findings import Finding
+from slam_observer_ros.common.signals import leaving_at_once
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -204,3 +208,23 @@ def table_of(title: str, rows: Mapping[str, str]) -> Table:
     for name, value in rows.items():
         table.add_row(name, value)
     return table
+
+
+def typed_words(environment: Mapping[str, str]) -> list[str] | None:
+    """Return the words after the program that a shell wants completed; None if it wants none."""
+    if '_ARGCOMPLETE' not in environment:
+        return None
+    return environment.get('COMP_LINE', '').split()[1:]
+
+
+def complete(parser: argparse.ArgumentParser) -> None:
+    """Write the completions and exit."""
+    import argcomplete  # which --help has no use for
+
+    argcomplete.autocomplete(parser)
+
+
+def completed_by(action: argparse.Action, completer: Callable[..., Sequence[str]]) -> None:
+    """Have an option's value completed by what a function returns, as argcomplete takes it."""
+    described: Any = action
+    described.completer = completer

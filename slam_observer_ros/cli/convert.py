@@ -15,9 +15,8 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
+from slam_observer_ros.recording.data_sets import load_mrclam, load_starry_night
 from slam_observer_ros.recording.graph_files import load_graph
-from slam_observer_ros.recording.mrclam import load_mrclam
-from slam_observer_ros.recording.starry_night import load_starry_night
 from slam_observer_ros.recording.writer import DataSet, write_data_set
 
 GRAPH_PARAMETERS = """\

@@ -26,7 +26,7 @@ from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.observer import core
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.settings.message_types import message_types
+from slam_observer_ros.settings.input_settings import message_types
 
 LISTENER = 'slam_observer_ros.nodes.live_inputs'
 """The program that hears topics; it is one of its own, as only ``nodes/`` knows ROS."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slam_observer_ros.cli.shell import leaving_at_once, SIGNALLED, stopping_once
+from slam_observer_ros.common.signals import leaving_at_once, SIGNALLED, stopping_once
 
 with leaving_at_once():
     import argparse
@@ -18,15 +18,20 @@ with leaving_at_once():
     from typing import Any, NoReturn
 
     from slam_observer_ros import __version__
-    from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
-    from slam_observer_ros.cli.shell import complete, typed_words
+    from slam_observer_ros.cli.console import (
+        complete,
+        MessageHandler,
+        PROGRAM,
+        show_message,
+        typed_words,
+    )
+    from slam_observer_ros.common.computing import use_one_thread
     from slam_observer_ros.common.errors import (
         IncompleteError,
         LossError,
         message_of,
         SlamObserverError,
     )
-    from slam_observer_ros.common.threads import use_one_thread
     from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2

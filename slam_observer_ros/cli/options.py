@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from slam_observer_ros.cli.shell import completed_by
+from slam_observer_ros.cli.console import completed_by
 from slam_observer_ros.common.errors import ParameterError, UsageError
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

@@ -16,8 +16,7 @@ from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
-from slam_observer_ros.settings.message_types import short_names
+from slam_observer_ros.settings.input_settings import InputSettings, short_names
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import from_parameters, table, Value
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
@@ -39,8 +40,8 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.known_map.merging import map_of
+from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.observer.designs import make_gains
-from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
 from slam_observer_ros.state.state import State
@@ -320,8 +321,8 @@ class Estimator:
         return self._localiser.is_localised
 
     @property
-    def localisation_problem(self) -> str:
-        """Why the pose in a loaded map is not known; empty if it is."""
+    def localisation_problem(self) -> Finding | None:
+        """Why the pose in a loaded map is not known; None if it is."""
         return self._localiser.problem(self._state.observer.A)
 
     @property

@@ -151,8 +151,8 @@ class EventBuilder:
     def _is_taken_as_base(self, event: VelocityEvent, now_ns: int) -> bool:
         """Return whether velocities of this frame still do not wait for their transform.
 
-        As one that moves comes after the velocities of its time, it is one of these that is looked
-        up, for as long as it would have waited, and then the next one.
+        A transform that moves arrives after the velocity of its instant. So the same velocity is
+        looked up again and again, for as long as it would have waited; then a newer one is.
         """
         frame_id = event.sensor_frame
         if frame_id not in self._taken_as_base:

@@ -1,20 +1,185 @@
-"""Where sensors are: measurements brought into the base frame."""
+"""Where sensors are: transforms of /tf and /tf_static, and measurements in the base frame.
+
+The semantics of transforms are tf2's: each frame has one parent, dynamic transforms are
+interpolated between their stamps and never extrapolated, static ones hold at all times. A slash
+that leads, as ROS 1 had it, is ignored. Of a fiducial that several cameras see, and that has each
+of them as its parent in turn, what each has seen is kept, too.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+import logging
 from typing import TypeVar
 
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError, TransformError
+from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.poses import pose_stack, PoseMessage
 from slam_observer_ros.settings.input_settings import InputSettings, Pose6
+
+logger = logging.getLogger(__name__)
+
+HISTORY_NS = 10_000_000_000
+"""How far back transforms are kept; tf2's default."""
+
+ALWAYS_NS = 2**63 - 1
+"""Newest stamp of what is static."""
+
+
+@dataclass(slots=True)
+class _Track:
+    """Poses of one frame in its parent, by stamp; of a static one there is only the latest."""
+
+    parent: str
+    is_static: bool
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[FloatArray] = field(default_factory=list)
+    strays: StrayStamps = field(default_factory=StrayStamps)
+
+    def insert(self, stamp_ns: int, pose: FloatArray) -> None:
+        if not self.is_static:
+            self._follow_jump(stamp_ns)
+        position = 0 if self.is_static else bisect_left(self.stamps_ns, stamp_ns)
+        is_known = self.is_static or self.stamps_ns[position : position + 1] == [stamp_ns]
+        self.stamps_ns[position : position + is_known] = [stamp_ns]
+        self.poses[position : position + is_known] = [pose]
+        outdated = bisect_left(self.stamps_ns, self.stamps_ns[-1] - HISTORY_NS)
+        del self.stamps_ns[:outdated], self.poses[:outdated]
+
+    def _follow_jump(self, stamp_ns: int) -> None:
+        """Forget all if stamps in a row are far behind the newest, one after the other.
+
+        That is a straggler of the lap before, when a recording is looped: what is to come would
+        seem too old.
+        """
+        if not self.stamps_ns or stamp_ns >= self.stamps_ns[-1] - NEAR_NS:
+            self.strays.clear()
+            return
+        last_ns = self.strays.last_ns
+        if (last_ns is None or stamp_ns > last_ns) and self.strays.add(stamp_ns):
+            self.stamps_ns, self.poses = [], []
+
+    def pose_at(self, stamp_ns: int) -> FloatArray | None:
+        """Interpolate the pose (4, 4); None outside of what is known."""
+        if self.is_static:
+            return self.poses[0]
+        after = bisect_left(self.stamps_ns, stamp_ns)
+        if after == len(self.stamps_ns) or (after == 0 and self.stamps_ns[0] != stamp_ns):
+            return None
+        if self.stamps_ns[after] == stamp_ns:
+            return self.poses[after]
+        start_ns, end_ns = self.stamps_ns[after - 1 : after + 1]
+        return se3.interpolate(
+            self.poses[after - 1], self.poses[after], (stamp_ns - start_ns) / (end_ns - start_ns)
+        )
+
+
+class TransformBuffer:
+    """A tree of frames over the last seconds."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[str, _Track] = {}  # of each frame in its newest parent
+        self._of_parents: dict[tuple[str, str], _Track] = {}  # by parent and frame
+        self._refused: set[str] = set()
+
+    def insert(
+        self, parent: str, child: str, stamp_ns: int, pose: FloatArray, *, is_static: bool = False
+    ) -> None:
+        """Take the pose (4, 4) of ``child`` in ``parent``; one of a frame to itself is refused."""
+        parent, child = parent.lstrip('/'), child.lstrip('/')
+        if parent == child:
+            self.refuse(child, 'it is to the frame itself')
+            return
+        track = self._of_parents.get((parent, child))
+        if track is None or track.is_static != is_static:
+            track = self._of_parents[parent, child] = _Track(parent, is_static)
+        self._tracks[child] = track
+        track.insert(stamp_ns, pose)
+
+    def refuse(self, child: str, reason: str) -> None:
+        """Log, once for each frame, why a transform is not used."""
+        if child not in self._refused:
+            self._refused.add(child)
+            logger.warning('%s', found('unused_transform', frame=child, reason=reason))
+
+    def clear(self) -> None:
+        """Forget what has a time, as after a jump of the clock; static transforms stay."""
+        self._tracks = {child: track for child, track in self._tracks.items() if track.is_static}
+        self._of_parents = {(track.parent, child): track for child, track in self._tracks.items()}
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
+        """Return the pose (4, 4) of ``source`` in ``target``; TransformError if unknown then."""
+        target_chain, source_chain = self._chains(target, source)
+        return se3.inverse(self._pose(target_chain, stamp_ns)) @ self._pose(source_chain, stamp_ns)
+
+    def lookup_child(self, parent: str, child: str, stamp_ns: int) -> FloatArray:
+        """As :meth:`lookup`, but what came with this parent, if others give the frame one, too."""
+        track = self._of_parents.get((parent.lstrip('/'), child.lstrip('/')))
+        pose = None if track is None else track.pose_at(stamp_ns)
+        return self.lookup(parent, child, stamp_ns) if pose is None else pose
+
+    def parent_of(self, frame: str) -> str | None:
+        """Return the parent of a frame; None if it has none."""
+        track = self._tracks.get(frame.lstrip('/'))
+        return None if track is None else track.parent
+
+    def newest_ns(self, target: str, source: str) -> int | None:
+        """Return the newest stamp at which both frames are known; None if they are not connected.
+
+        :data:`ALWAYS_NS` if all between them is static.
+        """
+        try:
+            chains = self._chains(target, source)
+        except TransformError:
+            return None
+        tracks = [self._tracks[frame] for chain in chains for frame in chain]
+        moving = (track.stamps_ns[-1] for track in tracks if not track.is_static)
+        return min(moving, default=ALWAYS_NS)
+
+    def _chains(self, target: str, source: str) -> tuple[list[str], list[str]]:
+        """Return the frames from each of the two up to below the first that both have above."""
+        target, source = target.lstrip('/'), source.lstrip('/')
+        target_chain, source_chain = self._ancestry(target), self._ancestry(source)
+        common = next((frame for frame in source_chain if frame in target_chain), None)
+        if common is None:
+            raise TransformError(f"'{source}' and '{target}' are not connected on /tf")
+        return (
+            target_chain[: target_chain.index(common)],
+            source_chain[: source_chain.index(common)],
+        )
+
+    def _ancestry(self, frame: str) -> list[str]:
+        """Return the frame, its parent, and so on up to the root."""
+        chain = [frame]
+        while (track := self._tracks.get(chain[-1])) is not None:
+            if track.parent in chain:
+                raise TransformError(f"'{frame}' is its own ancestor on /tf")
+            chain.append(track.parent)
+        return chain
+
+    def _pose(self, chain: list[str], stamp_ns: int) -> FloatArray:
+        """Return the pose (4, 4) of the chain's first frame in the last one's parent."""
+        pose = np.eye(4)
+        for frame in chain:
+            track = self._tracks[frame]
+            step = track.pose_at(stamp_ns)
+            if step is None:
+                raise TransformError(
+                    f"'{track.parent}' to '{frame}' is known "
+                    f'from {to_s(track.stamps_ns[0]):.3f} to {to_s(track.stamps_ns[-1]):.3f} s, '
+                    f'not at {to_s(stamp_ns):.3f} s'
+                )
+            pose = step @ pose
+        return pose
+
 
 OPTICAL = 'optical'
 """What the name of a frame has, by REP 103, whose axis z points forward; of others x does."""

@@ -19,7 +19,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
-from slam_observer_ros.known_map.distances import MappedLandmarks
+from slam_observer_ros.known_map.landmark_map import MappedLandmarks
 from slam_observer_ros.known_map.places import (
     Constellation,
     GATE,

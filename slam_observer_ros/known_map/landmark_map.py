@@ -1,12 +1,15 @@
-"""A map of landmarks known before anything is seen: saved by an earlier run, or surveyed."""
+"""A map of landmarks known before anything is seen, and which of them have given distances."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import permutations
+from typing import Any
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks, part_of_joint, tags_among
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 
@@ -89,3 +92,110 @@ class LandmarkMap:
         return KnownLandmarks(
             self.world_points, covariances, joint, self.orientations, self.orientation_sigmas
         ).moved(T)
+
+
+MAX_PAIRS = 2_000_000
+"""Pairs of landmarks that are kept: all those of 2000, in larger maps those close together."""
+
+MAX_TRIPLES = 1_000_000
+"""Triangles that are looked at for one of three given sides."""
+
+# Which of three landmarks are 0, 1 and 2, found in this order: both ends of one side, that first
+# which another side shares, and the other end of that.
+_CORNERS = np.zeros((3, 3, 3), dtype=np.int64)
+for _first, _second in permutations(range(3), 2):
+    _ends, _others = ((0, 1), (0, 2), (1, 2))[_first], ((0, 1), (0, 2), (1, 2))[_second]
+    (_shared,) = set(_ends) & set(_others)
+    _found = [_shared, *(set(_ends) - {_shared}), *(set(_others) - {_shared})]
+    _CORNERS[_first, _second] = np.argsort(_found)
+
+
+class MappedLandmarks:
+    """n landmarks of a map, and the distances between any that can be in view together."""
+
+    def __init__(self, points: FloatArray, covariances: FloatArray, axes: EstimatedAxes) -> None:
+        from scipy.spatial import cKDTree  # which only points without ids need
+
+        self.axes, k = axes, axes.point
+        self.points = points  # (n, 3) metres
+        self.covariances = np.ascontiguousarray(covariances[:, :k, :k])  # (n, k, k) m²
+        # (k, k) that of the landmark which is known worst: none is gated more tightly
+        spreads = np.trace(self.covariances, axis1=1, axis2=2)
+        self.largest_covariance = self.covariances[np.argmax(spreads)]
+        self.tree: Any = cKDTree(points[:, :k])
+        self.reach_m = 0.0  # up to which distance all pairs are known
+        self._most_m = np.inf  # up to which they can be
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def reach(self, distance_m: float) -> float:
+        """Get ready for distances of up to so many metres; return up to how many it can be."""
+        if self.reach_m < distance_m and self.reach_m < self._most_m:
+            self.reach_m = min(1.2 * distance_m, self._most_m)
+            while self.tree.count_neighbors(self.tree, self.reach_m) > 2 * MAX_PAIRS:
+                self.reach_m = self._most_m = 0.8 * self.reach_m
+            self._sort_pairs()
+        return self.reach_m
+
+    def within_reach(self, points: FloatArray) -> IntArray:
+        """Return which points (m, 3) are so near the first one that all pairs are in reach."""
+        from_first_m = np.linalg.norm(points - points[0], axis=1)
+        return np.flatnonzero(from_first_m <= 0.4 * self.reach(2.5 * float(from_first_m.max())))
+
+    def pairs(self, distance_m: float, tolerance_m: float) -> IntArray:
+        """Return landmarks (h, 2) that are about so far from each other, in either order."""
+        limits = [distance_m - tolerance_m, distance_m + tolerance_m]
+        first, last = np.searchsorted(self._distances, limits)
+        pairs = self._pairs[first:last]
+        return np.concatenate([pairs, pairs[:, ::-1]])
+
+    def triangles(self, sides_m: FloatArray, tolerances_m: FloatArray) -> IntArray | None:
+        """Return landmarks (h, 3) with distances from 0 to 1, 0 to 2 and 1 to 2 as given (3,).
+
+        None if there are too many to look at.
+        """
+        # Two of them by the shortest side, which the fewest have, in an order that …
+        turns = np.argsort(sides_m)
+        corners = _CORNERS[turns[0], turns[1]]
+        sides_m, tolerances_m = sides_m[turns], tolerances_m[turns]
+        pairs = self.pairs(sides_m[0], tolerances_m[0])
+        pairs = pairs[np.argsort(pairs[:, 0])]
+        # … lets the third one be found soon, by the second side.
+        key = self._key(pairs[:, 0], sides_m[1])
+        first = np.searchsorted(self._keys, key - tolerances_m[1])
+        counts = np.searchsorted(self._keys, key + tolerances_m[1]) - first
+        if counts.sum() > MAX_TRIPLES:
+            return None
+        pairs = np.repeat(pairs, counts, axis=0)
+        third = self._partners[_ranges(first, counts)]
+        lines = self.points[pairs[:, 1]] - self.points[third]
+        off_m = np.sqrt(np.einsum('ij,ij->i', lines, lines)) - sides_m[2]
+        fits: BoolArray = (np.abs(off_m) <= tolerances_m[2]) & (third != pairs[:, 1])
+        found: IntArray = np.column_stack([pairs[fits], third[fits]])
+        return found[:, corners]
+
+    def _sort_pairs(self) -> None:
+        """Keep all pairs up to the reach, by distance, and by their first landmark as well."""
+        pairs = self.tree.query_pairs(self.reach_m, output_type='ndarray').astype(np.int32)
+        lines = self.points[pairs[:, 0]] - self.points[pairs[:, 1]]
+        distances = np.sqrt(np.einsum('ij,ij->i', lines, lines))
+        order = np.argsort(distances)
+        self._pairs: IntArray = pairs[order]
+        self._distances: FloatArray = distances[order]
+        if self.axes.point == 3:
+            keys = self._key(pairs.T, distances).ravel()
+            by_first = np.argsort(keys)
+            self._keys: FloatArray = keys[by_first]
+            self._partners: IntArray = pairs.T[::-1].ravel()[by_first]
+
+    def _key(self, first: IntArray, distances_m: FloatArray | float) -> FloatArray:
+        """Return numbers that sort pairs by their first landmark, then by distance."""
+        return np.asarray(first * (2.0 * self.reach_m + 1.0) + distances_m)
+
+
+def _ranges(first: IntArray, counts: IntArray) -> IntArray:
+    """Return the numbers of ranges that begin at ``first`` (q,), one range after the other."""
+    before = np.cumsum(counts) - counts
+    ranges: IntArray = np.arange(int(counts.sum())) + np.repeat(first - before, counts)
+    return ranges

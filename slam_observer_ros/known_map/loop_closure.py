@@ -194,7 +194,7 @@ def _within_reach(state: State, new: IntArray, old: IntArray) -> IntArray:
 def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray] | None:
     """Return which old landmarks (q,) are certainly which new ones (q,), if that is so."""
     from slam_observer_ros.known_map.constellation import find_places  # which few runs need
-    from slam_observer_ros.known_map.distances import MappedLandmarks
+    from slam_observer_ros.known_map.landmark_map import MappedLandmarks
     from slam_observer_ros.known_map.places import Anywhere, Constellation, Near
 
     P = state.gains.joint_covariance(np.append(new, old))

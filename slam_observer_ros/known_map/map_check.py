@@ -13,8 +13,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map.constellation import find_places
-from slam_observer_ros.known_map.distances import MappedLandmarks
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.landmark_map import LandmarkMap, MappedLandmarks
 from slam_observer_ros.known_map.places import Anywhere, Constellation
 
 SAME_M = 0.2

@@ -27,7 +27,7 @@ from slam_observer_ros.geometry.matrices import (
     turned,
     with_blocks,
 )
-from slam_observer_ros.known_map.distances import MappedLandmarks
+from slam_observer_ros.known_map.landmark_map import MappedLandmarks
 
 GATE = 3.7
 """Standard deviations that a point may be off."""

@@ -11,8 +11,7 @@ from rclpy.timer import Timer
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed

@@ -22,8 +22,12 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.detections import observed_tags
 from slam_observer_ros.messages.poses import decode_transforms, TRANSFORMS
 from slam_observer_ros.nodes.message_classes import message_class
-from slam_observer_ros.settings.input_settings import InputSettings
-from slam_observer_ros.settings.message_types import message_types, MessageType, Role
+from slam_observer_ros.settings.input_settings import (
+    InputSettings,
+    message_types,
+    MessageType,
+    Role,
+)
 
 DISCOVERY_S = 1.0
 """Time after which publishers have been found, unless an announcement was lost."""

@@ -10,8 +10,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from slam_observer_ros.common.errors import ParameterError, SlamObserverError
-from slam_observer_ros.nodes.guarded_node import Entities
-from slam_observer_ros.nodes.logs import forward_logging
+from slam_observer_ros.nodes.guarded_node import Entities, forward_logging
 from slam_observer_ros.nodes.message_classes import install_command
 from slam_observer_ros.nodes.observer_core import ObserverCore
 from slam_observer_ros.nodes.ros_parameters import (

@@ -14,7 +14,7 @@ from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.evaluation.run_record import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.nodes.logs import ThrottledLog
+from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
 from slam_observer_ros.nodes.publishing.pose_broadcaster import TransformPublisher
 from slam_observer_ros.nodes.ros_parameters import (

@@ -1312,5 +1312,5 @@ static struct PyModuleDef definition = {
 };
 
 PyMODINIT_FUNC PyInit__core(void) {
-    return PyModule_Create(&definition);
+    return make_module(&definition);
 }

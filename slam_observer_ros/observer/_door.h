@@ -95,6 +95,14 @@ static inline int read_fields(Door *door, PyObject *tuple, const char *const spe
     return 1;
 }
 
+/* A module that says which sources it was built from, as setup.py does to the compiler. */
+static inline PyObject *make_module(PyModuleDef *definition) {
+    PyObject *module = PyModule_Create(definition);
+    if (module != NULL && PyModule_AddIntConstant(module, "SOURCES", SOURCES))
+        Py_CLEAR(module);
+    return module;
+}
+
 static inline int are_within(const i64 *numbers, Py_ssize_t count, i64 most) {
     for (Py_ssize_t j = 0; j < count; j++)
         if (numbers[j] < 0 || numbers[j] > most)

@@ -16,14 +16,24 @@ observer*, 2017). Other coordinates, or one more thing to estimate, are a change
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import slam_group
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.slam_group import SlamElement
+
+_IDENTITY = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlamElement:
+    """Element X = (A, a_1, …, a_n) of SLAM_n(3), or a stack of them: a pose and translations."""
+
+    A: FloatArray  # (…, 4, 4)
+    a: FloatArray  # (…, n, 3)
 
 
 class Step(NamedTuple):
@@ -173,7 +183,7 @@ class Chart:
         parts = x[self.first :].reshape(-1, self.stride)
         xi, omega, u = np.split(parts, [k, k + self.turn], axis=1)
         return Step(
-            slam_group.exp(axes.full_pose(x[:p]), axes.full_points(xi)),
+            slam_exp(axes.full_pose(x[:p]), axes.full_points(xi)),
             x[p : self.robot],
             axes.full_turns(omega) if self.turn else None,
             axes.full_points(u) if self.velocity else None,
@@ -189,3 +199,18 @@ def sheared(P: FloatArray, first: int, L: FloatArray) -> FloatArray:
     result[first:] += half
     result[:, first:] += half.T  # its mirror image, so that P stays symmetric
     return result
+
+
+def slam_exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
+    """Exponential of SLAM_n(3): (exp Δ, J(Ω_Δ) d_i), with the left Jacobian J of SO(3).
+
+    With held body velocity and landmark velocities, X · exp(V dt, v dt) solves the
+    lifted kinematics exactly over dt.
+    """
+    phi, v = Delta[..., :3], Delta[..., 3:]
+    K, J = so3.hat(phi), so3.left_jacobian(phi)
+    # exp φ = I + K J, as J is the integral of exp(s φ).
+    if Delta.ndim == 1:  # as at each correction, at half the cost
+        return SlamElement(se3.pose(_IDENTITY + K.dot(J), J.dot(v)), d.dot(J.T))
+    R = _IDENTITY + K @ J
+    return SlamElement(se3.pose(R, (J @ v[..., None])[..., 0]), d @ J.swapaxes(-1, -2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from slam_observer_ros.common.compiled import compiled, VARIABLE
+from slam_observer_ros.common.computing import compiled, VARIABLE
 from slam_observer_ros.observer import step
 
 COMPILED = compiled('observer._core')
@@ -16,7 +16,7 @@ def description() -> str:
         return 'C'
     if os.environ.get(VARIABLE) == 'numpy':
         return f'numpy, as {VARIABLE} says'
-    return 'numpy, three times slower: no C compiler or Python headers when this was installed'
+    return 'numpy, three times slower: the core was not compiled, or from other sources'
 
 
 advance = step.advance if COMPILED is None else COMPILED.advance

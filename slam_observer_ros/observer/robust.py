@@ -1,8 +1,11 @@
 """How far an observation is trusted: a Mahalanobis gate, then Huber's weight on what passes.
 
-Where the state is uncertain the gate is wide, and outliers pass it; see
-:func:`far_from_the_others`. Residuals r are (m, k), metres; ``predicted`` (m k, m k) is their
-covariance C P Cᵀ without the ``noise`` (m, k, k) of the observations, m².
+The usual step has both once more (observer/step.py and observer/_core.c); in smoothing, a weight
+that falls off takes the gate's place (smoothing/observations.py). Where the state is uncertain
+the gate is wide, and outliers pass it; see :func:`far_from_the_others`.
+
+Residuals r are (m, k), metres; ``predicted`` (m k, m k) is their covariance C P Cᵀ without the
+``noise`` (m, k, k) of the observations, m².
 """
 
 from __future__ import annotations
@@ -59,6 +62,11 @@ def observation_weights(
     return weights
 
 
+def accepted(distances: FloatArray, gate: float) -> BoolArray:
+    """Return which residuals pass the gate, by their Mahalanobis distances."""
+    return distances <= gate
+
+
 def are_far(sensor_distances: FloatArray, gate: float) -> BoolArray:
     """Return which residuals are suspect by their distances (m,) in the sensor's noise alone."""
     return sensor_distances > SUSPICION * gate
@@ -83,7 +91,7 @@ def gated(
     r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: float
 ) -> tuple[BoolArray, FloatArray]:
     """Return which observations (m,) pass the gate, and their part of ``predicted``."""
-    passed = distances(r, predicted, noise) <= gate
+    passed = accepted(distances(r, predicted, noise), gate)
     used = np.flatnonzero(np.repeat(passed, r.shape[1]))
     return passed, predicted[used][:, used]
 

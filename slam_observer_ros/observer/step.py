@@ -19,10 +19,11 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3, slam_group, so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, with_blocks
 from slam_observer_ros.geometry.sensor_mounting import sensitivity as sensor_sensitivity
+from slam_observer_ros.observer.chart import slam_exp
 from slam_observer_ros.observer.flat_arrays import (
     Advanced,
     Estimate,
@@ -33,6 +34,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Seen,
 )
 from slam_observer_ros.observer.robust import (
+    accepted,
     are_far,
     far_from_the_others,
     huber_weights,
@@ -267,8 +269,8 @@ def observe(
     learnt = None if factors is None else _learnt(factors, residuals, judged.S, limits.gate)
     if factors is not None and learnt is None:
         return UNUSUAL
-    if judged.distances is not None and np.count_nonzero(judged.distances > limits.gate):
-        out.weights[:] = judged.distances <= limits.gate
+    if judged.distances is not None and not accepted(judged.distances, limits.gate).all():
+        out.weights[:] = accepted(judged.distances, limits.gate)
         _take_over(factors, learnt)
         return REJECTS
     if limits.weighs_meanings and _may_be_something_else(residuals, judged, limits.gate):
@@ -279,7 +281,7 @@ def observe(
         return UNUSUAL
     # (28)  X̂ ← exp(−K r) · X̂:  Â ← exp(ε) Â,  ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i
     axes = residuals.axes
-    X = slam_group.exp(axes.full_pose(dx[: axes.p]), axes.full_points(dx[x.first :]))
+    X = slam_exp(axes.full_pose(dx[: axes.p]), axes.full_points(dx[x.first :]))
     R_D = X.A[:3, :3]
     out.A[:] = X.A.dot(x.A)
     x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))
@@ -421,7 +423,7 @@ def _learnt(
         squared, m = float(r.dot(solved[:, 0])), len(r) // k
         if squared <= gate**2:
             break
-        passed = mahalanobis(r.reshape(m, k), diagonal_blocks(S, k)) <= gate
+        passed = accepted(mahalanobis(r.reshape(m, k), diagonal_blocks(S, k)), gate)
         if not m < 2 * np.count_nonzero(passed) < 2 * m:
             break
         used = np.flatnonzero(np.repeat(passed, k))  # some few are left out

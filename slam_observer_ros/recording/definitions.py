@@ -17,7 +17,7 @@ from slam_observer_ros.messages.detections import (
     OTHER_DETECTIONS,
 )
 from slam_observer_ros.messages.registry import Decode, decoders
-from slam_observer_ros.settings.message_types import message_types
+from slam_observer_ros.settings.input_settings import message_types
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

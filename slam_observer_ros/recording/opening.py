@@ -5,7 +5,7 @@ rosbag2 compresses with zstd: each message, or each file as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 import hashlib
 from itertools import islice
 from pathlib import Path, PurePath
@@ -25,7 +25,8 @@ from slam_observer_ros.recording.sources import (
     Topic,
 )
 
-FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
+COMPRESSED = '.zstd'
+"""Suffix of a file that was compressed as a whole, behind that of its format."""
 
 MAX_METADATA_BYTES = 10_000_000
 """Bytes of a metadata.yaml that is read; that of a thousand files has a tenth of them."""
@@ -57,14 +58,13 @@ def open_source(path: Path) -> tuple[MessageSource, str | None]:
         raise RecordingError(message_of(error)) from error
     if path.is_dir():
         return _open_directory(path)
-    if path.suffix == SUFFIX:
+    if path.suffix == COMPRESSED:
         return _open_compressed(path)
-    if path.suffix not in FILE_SUFFIXES:
+    if path.suffix not in FORMATS:
         raise RecordingError(
-            f'{path}: not a recording; give a {", ".join(FILE_SUFFIXES)} file '
-            'or a rosbag2 directory'
+            f'{path}: not a recording; give a {", ".join(FORMATS)} file or a rosbag2 directory'
         )
-    source, warning = _open_mcap(path) if path.suffix == '.mcap' else _open_bag(path)
+    source, warning = FORMATS[path.suffix](path)
     if path.suffix == '.bag':  # ROS 1 compresses no messages, and the first may be unreadable
         return source, warning
     try:
@@ -78,7 +78,7 @@ def files_of(path: Path) -> list[Path]:
     """List the files that a recording consists of, compressed ones as well."""
     if not path.is_dir():
         return [path]
-    parts = (*FILE_SUFFIXES, 'metadata.yaml')
+    parts = (*FORMATS, 'metadata.yaml')
     return [file for file in sorted(path.iterdir()) if any(part in file.name for part in parts)]
 
 
@@ -97,8 +97,8 @@ def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
     if len(stated.names) < 2:
         missing = []
     source, warning = _open_parts(path, files, missing, stated.message_count)
-    stems = {file.name.removesuffix(SUFFIX) for file in files}
-    others = [f.name for f in _storage_files(path) if f.name.removesuffix(SUFFIX) not in stems]
+    stems = {file.name.removesuffix(COMPRESSED) for file in files}
+    others = [f.name for f in _storage_files(path) if f.name.removesuffix(COMPRESSED) not in stems]
     if others:  # as after a power cut, or put there by hand
         unlisted = f'{path}: metadata.yaml does not list {", ".join(others)}, left out'
         warning = f'{warning}; {unlisted}' if warning else unlisted
@@ -107,7 +107,7 @@ def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
 
 def _existing(file: Path) -> Path | None:
     """Return a file that metadata names, which somebody may have decompressed or compressed."""
-    names = (file.name, file.name.removesuffix(SUFFIX), f'{file.name}{SUFFIX}')
+    names = (file.name, file.name.removesuffix(COMPRESSED), f'{file.name}{COMPRESSED}')
     return next((file.with_name(name) for name in names if file.with_name(name).exists()), None)
 
 
@@ -164,7 +164,7 @@ def _only_file(directory: Path, why: str = 'without metadata.yaml') -> Path:
 
 
 def _storage_files(path: Path) -> list[Path]:
-    suffixes = [suffix + end for suffix in ('.mcap', '.db3') for end in ('', SUFFIX)]
+    suffixes = [suffix + end for suffix in ('.mcap', '.db3') for end in ('', COMPRESSED)]
     return [file for file in sorted(path.iterdir()) if file.name.endswith(tuple(suffixes))]
 
 
@@ -237,7 +237,12 @@ def _other_encodings(path: Path, source: McapSource) -> str | None:
     return f'{path}: {encodings.total()} channels of other encodings are left out: {names}'
 
 
-SUFFIX = '.zstd'
+FORMATS: dict[str, Callable[[Path], tuple[MessageSource, str | None]]] = {
+    '.mcap': _open_mcap,
+    '.db3': _open_bag,
+    '.bag': _open_bag,
+}
+"""How a file of each suffix is opened; a directory of rosbag2 has .mcap or .db3 files."""
 
 _MAGIC = bytes.fromhex('28b52ffd')
 """How what is compressed begins, and no message in CDR does."""
@@ -288,7 +293,7 @@ def decompressed_file(path: Path) -> tuple[Path, TemporaryDirectory[str]]:
     import zstandard  # which few recordings need
 
     directory = TemporaryDirectory(prefix='slam_observer_')
-    copy = Path(directory.name, path.name.removesuffix(SUFFIX))
+    copy = Path(directory.name, path.name.removesuffix(COMPRESSED))
     with path.open('rb') as source, copy.open('wb') as target:
         try:
             zstandard.ZstdDecompressor().copy_stream(source, target)

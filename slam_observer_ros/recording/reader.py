@@ -25,8 +25,7 @@ from slam_observer_ros.inputs.event_builder import (
     Measured,
     with_receive_time,
 )
-from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms, TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock
 from slam_observer_ros.messages.registry import BlockDecoder
 from slam_observer_ros.recording.contents import Arrivals, Contents
@@ -294,8 +293,8 @@ class Recording:
             return decode(raw)
         except MessageError as error:
             if raw.topic.name not in self.malformed:
-                finding = found('malformed_message', path=self.path, topic=raw.topic, error=error)
-                logger.warning('%s', finding)
+                topic = f'{raw.topic.name} of {self.path}'
+                logger.warning('%s', found('malformed_message', topic=topic, error=error))
             self.malformed[raw.topic.name] += 1
             return None
 

@@ -16,7 +16,7 @@ from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.events import IMPOSSIBLE_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock
 
 logger = logging.getLogger(__name__)

@@ -12,8 +12,13 @@ from slam_observer_ros.common.findings import found
 from slam_observer_ros.messages.clouds import CLOUDS
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recording.sources import last_part, Topic
-from slam_observer_ros.settings.input_settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
-from slam_observer_ros.settings.message_types import message_types
+from slam_observer_ros.settings.input_settings import (
+    AUTO,
+    InputSettings,
+    message_types,
+    ON_TF,
+    POSE_DIFFERENCES,
+)
 
 TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
 """Topics with one of these between the slashes of their name hold truth, not measurements."""

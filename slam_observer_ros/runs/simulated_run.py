@@ -14,7 +14,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import Decay, fit_decay
 from slam_observer_ros.evaluation.run_record import PoseTruth
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.observer.innovation import lyapunov
+from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.runs.sampling import PoseSamples
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation

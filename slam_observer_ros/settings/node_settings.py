@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from slam_observer_ros.settings.input_settings import AUTO, InputSettings
-from slam_observer_ros.settings.message_types import short_names
+from slam_observer_ros.settings.input_settings import AUTO, InputSettings, short_names
 from slam_observer_ros.settings.parameter_table import parameter
 
 

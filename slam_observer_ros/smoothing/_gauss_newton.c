@@ -731,5 +731,5 @@ static struct PyModuleDef definition = {
 };
 
 PyMODINIT_FUNC PyInit__gauss_newton(void) {
-    return PyModule_Create(&definition);
+    return make_module(&definition);
 }

@@ -13,6 +13,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.sensor_models.sensing import turn_sensitivity
 from slam_observer_ros.state.matching import corrected_again, MatchedObservation, residuals_of
 from slam_observer_ros.state.state import State
@@ -31,7 +32,7 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
         return matched
     gains.learn_motion_noise(matched.residuals)
     tags, gate = state.observer.orientations, state.settings.rejection_threshold
-    are_near = state.gains.distances(matched.residuals) <= gate
+    are_near = accepted(state.gains.distances(matched.residuals), gate)
     seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
     if not len(seen.rows):
         return matched

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import slam_group
+from slam_group import SlamElement
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, slam_group, so3
-from slam_observer_ros.geometry.slam_group import SlamElement
+from slam_observer_ros.geometry import se3, so3
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from strategies import elements, LANDMARK_COUNTS, points, poses, states, velocities
-
-from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, slam_group, so3
-from slam_observer_ros.geometry.slam_group import (
+import slam_group
+from slam_group import (
     compose,
     identity,
     inverse,
@@ -21,6 +18,10 @@ from slam_observer_ros.geometry.slam_group import (
     Tangent,
     TotalState,
 )
+from strategies import elements, LANDMARK_COUNTS, points, poses, states, velocities
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.geometry import se3, so3
 
 ROUNDING = 1e-11
 # Central differences with this step: errors of about h² |u|³ and 1e-15 / h.

@@ -6,12 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+import slam_group
+from slam_group import SlamElement, TotalState
 from strategies import elements, generators, LANDMARK_COUNTS, points, poses, states
-
-from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, slam_group, so3, tag_group
-from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
-from slam_observer_ros.geometry.tag_group import (
+import tag_group
+from tag_group import (
     alpha,
     compose,
     inverse,
@@ -22,6 +21,9 @@ from slam_observer_ros.geometry.tag_group import (
     TagOutput,
     TagState,
 )
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.geometry import se3, so3
 
 ROUNDING = 1e-11
 STEP = 1e-6

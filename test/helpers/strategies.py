@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 import numpy as np
+from slam_group import SlamElement, SlamVelocity, TotalState
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.slam_group import SlamElement, SlamVelocity, TotalState
 
 LANDMARK_COUNTS = (0, 1, 25)
 

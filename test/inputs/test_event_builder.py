@@ -13,8 +13,7 @@ from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import drop_reason, EventBuilder, MAX_WAITING
-from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.settings.input_settings import InputSettings
 

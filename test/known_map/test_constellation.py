@@ -12,7 +12,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.known_map import constellation
 from slam_observer_ros.known_map.constellation import find_places
-from slam_observer_ros.known_map.distances import MappedLandmarks
+from slam_observer_ros.known_map.landmark_map import MappedLandmarks
 from slam_observer_ros.known_map.places import Anywhere, Constellation, Near, Weighing
 
 SIGMA_M = 0.02

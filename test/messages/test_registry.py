@@ -20,7 +20,7 @@ from slam_observer_ros.messages.poses import decode_twist_stamped
 from slam_observer_ros.messages.registry import decoders, reads
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.writer import RecordingWriter
-from slam_observer_ros.settings import message_types
+from slam_observer_ros.settings import input_settings
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import table
@@ -34,7 +34,7 @@ ACCEL = 'geometry_msgs/msg/AccelStamped'
 def _registered(monkeypatch):
     """What a test registers is gone after it."""
     decoders('landmarks')
-    monkeypatch.setattr(message_types, '_REGISTERED', dict(message_types._REGISTERED))
+    monkeypatch.setattr(input_settings, '_REGISTERED', dict(input_settings._REGISTERED))
 
 
 def choices(settings, name):
@@ -124,7 +124,7 @@ def test_parameters_and_help_offer_a_type_and_an_unread_one_is_said_to_be_none(
     assert 'BeaconArray' in of_landmarks.partition('--imu TOPIC')[0]
     assert 'BeaconArray' in choices(InputSettings, 'landmarks_type')
     assert 'BeaconArray' in choices(ObserverNodeSettings, 'landmarks_type')
-    del message_types._REGISTERED['landmarks', BEACONS]
+    del input_settings._REGISTERED['landmarks', BEACONS]
     with (
         Recording(write_beacons(tmp_path / 'run.mcap')) as recording,
         pytest.raises(RecordingError, match=rf'no landmark topic: .*{BEACONS}'),

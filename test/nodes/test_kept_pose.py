@@ -16,9 +16,13 @@ from slam_observer_ros import Estimator, Settings
 from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.pose_file import read_pose, StoredPose, write_pose
-from slam_observer_ros.nodes.services import kept_pose
-from slam_observer_ros.nodes.services.kept_pose import KeptPose
+from slam_observer_ros.nodes.services import initial_pose
+from slam_observer_ros.nodes.services.initial_pose import (
+    KeptPose,
+    read_pose,
+    StoredPose,
+    write_pose,
+)
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.simulation import Scenario
 
@@ -30,7 +34,7 @@ COVARIANCE = np.diag([0.0, 0.0, 0.01, 0.04, 0.04, 0.0])
 def fixture_kept(tmp_path, monkeypatch):
     """A kept pose in a file, the estimator that it is for, and what the clock says."""
     clock = SimpleNamespace(now_s=1e9)
-    monkeypatch.setattr(kept_pose.time, 'time', lambda: clock.now_s)
+    monkeypatch.setattr(initial_pose.time, 'time', lambda: clock.now_s)
     path = tmp_path / 'deep' / 'pose.yaml'
     node, estimator = Mock(), Estimator(Settings(two_d_mode=True))
     settings = ObserverNodeSettings(pose_file=str(path), pose_file_max_age=60.0)

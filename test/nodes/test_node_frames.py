@@ -22,7 +22,7 @@ from tf2_msgs.msg import TFMessage
 from slam_observer_ros.evaluation.run_record import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.intake.transforms import LiveTransforms

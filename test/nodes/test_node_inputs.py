@@ -29,11 +29,12 @@ import ros_messages
 from sensor_msgs.msg import Imu, PointCloud2
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import decode_twist, ODOMETRY
-from slam_observer_ros.nodes.intake import warning_decoders
+from slam_observer_ros.nodes.intake import chosen_inputs
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
@@ -193,7 +194,7 @@ def test_points_whose_ids_are_named_otherwise_are_reported_once(message_type, na
             ros_messages.point_cloud(np.ones((count, 3)), {name: np.ones(count)})
             for count in (0, 2, 2)
         ]
-    decode = warning_decoders.CloudDecoder(node, message_type)
+    decode = chosen_inputs.CloudDecoder(node, message_type)
     decoded = [decode(ros_messages.serialise(cloud), 0) for cloud in clouds]
     assert [len(message.ids) for message in decoded] == [0, 2, 2]
     logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
@@ -210,29 +211,48 @@ def test_points_whose_ids_are_named_otherwise_are_reported_once(message_type, na
 def test_an_odometry_with_poses_alone_is_reported_once(velocity, speed, is_logged):
     node = Mock()
     node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
-    decode = warning_decoders.OdometryDecoder(node)
+    decode = chosen_inputs.OdometryDecoder(node)
     for step in range(20):
         message = odometry(round(speed * step * SECOND), 0, velocity)
         assert_allclose(decode(serialize_message(message), 0).body_velocity, velocity)
     logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
     assert len(logged) == is_logged
-    assert all("all velocities on '/robot/twist' are zero" in text for text in logged)
-    assert all("velocity_source to 'pose_differences'" in text for text in logged)
+    finding = found('zero_twist', topic="'/robot/twist'")
+    assert decode.doubt == (finding if is_logged else None)
+    assert all(text == finding.text() for text in logged)
 
 
 def test_that_the_velocities_of_an_odometry_are_missing_is_said_until_they_come():
     node = Mock()
     node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
     node.get_clock.return_value = FakeClock()
-    decode = warning_decoders.OdometryDecoder(node)
+    decode = chosen_inputs.OdometryDecoder(node)
     source = InputTopic(node, 'twist', {ODOMETRY: decode}, Mock(), QOS)
     receive = node.create_subscription.call_args.args[2]
     for step in range(5):
         message = odometry(step * SECOND, 0, np.zeros(6))
         receive(serialize_message(message), {'received_timestamp': 0})
-    assert source.problem.startswith("all velocities on '/robot/twist' are zero")
+    assert source.doubt.what == "all velocities on '/robot/twist' are zero, but its poses move"
     receive(serialize_message(odometry(5 * SECOND, 0)), {'received_timestamp': 0})
-    assert not source.problem
+    assert source.doubt is None
+
+
+def test_a_message_that_cannot_be_read_is_said_as_a_recordings_is():
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    node.get_clock.return_value = FakeClock()
+    source = InputTopic(
+        node, 'twist', {ODOMETRY: chosen_inputs.OdometryDecoder(node)}, Mock(), QOS
+    )
+    receive = node.create_subscription.call_args.args[2]
+    assert source.last_malformed is None
+    receive(serialize_message(odometry(0, 0))[:40], {'received_timestamp': 0})
+    assert source.last_malformed.kind == 'malformed_message'
+    assert source.last_malformed.what.startswith("malformed message on '/robot/twist': ")
+    (source._log._next_s, source._log._quiet_until_s) = {}, 0.0
+    receive(serialize_message(odometry(0, 0))[:40], {'received_timestamp': 0})
+    (logged,) = (call.args[0] for call in node.get_logger().warning.call_args_list)
+    assert logged == source.last_malformed.text(' (2 so far)')
 
 
 def landmarks_input(type_name, feed=None, **settings):
@@ -311,7 +331,7 @@ def test_what_else_a_topic_carries_is_answered_with_the_types_that_are_read():
 def test_an_odometry_without_an_attitude_has_a_velocity():
     message = odometry(0, 0, np.zeros(6))
     message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
-    decode = warning_decoders.OdometryDecoder(Mock())
+    decode = chosen_inputs.OdometryDecoder(Mock())
     assert_allclose(decode(serialize_message(message), 0).body_velocity, 0.0)
 
 
@@ -324,13 +344,13 @@ def test_a_velocity_without_poses_has_no_pose_differences():
 @pytest.mark.parametrize('is_seen', [False, True])
 def test_fiducials_on_tf_by_another_name_are_reported_once(monkeypatch, is_seen):
     node, now = Mock(), [0.0]
-    monkeypatch.setattr(warning_decoders, 'time', Mock(monotonic=lambda: now[0]))
-    decode = warning_decoders.TagDecoder(node, 'dock')
+    monkeypatch.setattr(chosen_inputs, 'time', Mock(monotonic=lambda: now[0]))
+    decode = chosen_inputs.TagDecoder(node, 'dock')
     for name in ('dock7' if is_seen else 'fiducial_7', 'wheel', 'wheel'):
         names, position, quaternion = ('camera', name), (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)
         sent = [ros_messages.transform_stamped(names, position, quaternion)]
         decode(ros_messages.serialise(ros_messages.make('tf2_msgs/msg/TFMessage', sent)), 0)
-        now[0] += warning_decoders.WITHOUT_TAG_S
+        now[0] += chosen_inputs.WITHOUT_TAG_S
     logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
     assert len(logged) == (not is_seen)
     assert all("named 'dock<id>'" in text for text in logged)
@@ -614,7 +634,7 @@ def test_a_callback_gets_what_dds_knows_of_a_message_from_every_executor():
 def test_a_twist_along_the_axes_of_the_odometrys_frame_is_reported_once():
     node = Mock()
     node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
-    decode = warning_decoders.OdometryDecoder(node)
+    decode = chosen_inputs.OdometryDecoder(node)
     for step in range(500):  # ahead, but along y of its frame
         angle, stamp_ns = np.pi / 2, step * SECOND // 50
         message = Odometry(header=MESSAGES.header(stamp_ns, 'odom'), child_frame_id='base_link')
@@ -624,6 +644,6 @@ def test_a_twist_along_the_axes_of_the_odometrys_frame_is_reported_once():
         message.twist.twist.linear.y = 0.5
         decode(serialize_message(message), 0)
     (text,) = (call.args[0] for call in node.get_logger().warning.call_args_list)
-    assert text == decode.problem
-    assert text.startswith("the twist on '/robot/twist' is along the axes of 'odom'")
-    assert text.endswith("set velocity_source to 'pose_differences'")
+    assert text == decode.doubt.text()
+    assert decode.doubt.kind == 'wrong_twist'
+    assert text.startswith("The twist on '/robot/twist' is along the axes of 'odom'")

@@ -25,8 +25,7 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes.intake.clocks import ClockChange, MAX_LOOKS
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed

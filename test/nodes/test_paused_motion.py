@@ -9,7 +9,7 @@ import pytest
 from slam_observer_ros import Estimator, Settings
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.services.control_services import PausedMotion
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

@@ -15,11 +15,10 @@ import pytest
 
 from slam_observer_ros.common.errors import DataSetError, RecordingError
 from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.recording.data_sets import load_mrclam, load_starry_night
 from slam_observer_ros.recording.graph_files import load_graph
-from slam_observer_ros.recording.mrclam import load_mrclam
 from slam_observer_ros.recording.opening import MAX_METADATA_BYTES
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.starry_night import load_starry_night
 from slam_observer_ros.recording.writer import DataSet, RecordingWriter
 
 GRAPH = """\

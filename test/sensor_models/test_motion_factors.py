@@ -13,7 +13,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.runs.health import of_noise
-from slam_observer_ros.runs.recorder import NisTally
+from slam_observer_ros.runs.reported_run import NisTally
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion

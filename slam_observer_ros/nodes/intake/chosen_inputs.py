@@ -1,28 +1,46 @@
-"""Which topics the observer reads, and how they are decoded, as the parameters choose."""
+"""Which topics the observer reads, and how they are decoded, as the parameters choose.
+
+Decoders warn once of what the messages do not contain.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+import time
 from typing import Any
 
+import numpy as np
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.messages.clouds import CLOUDS
-from slam_observer_ros.messages.poses import decode_odometry_pose, ODOMETRY, TRANSFORMS
-from slam_observer_ros.messages.registry import decoders
+from slam_observer_ros.common.findings import Finding, found
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.inputs.odometry import OdometryCheck
+from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.messages.clouds import CLOUDS, ID_NAME, missing_ids, read_fields
+from slam_observer_ros.messages.detections import no_tags, observed_tags
+from slam_observer_ros.messages.poses import (
+    decode_odometry,
+    decode_odometry_pose,
+    decode_transforms,
+    ODOMETRY,
+    PoseMessage,
+    TRANSFORMS,
+)
+from slam_observer_ros.messages.registry import Decode, decoders
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
-from slam_observer_ros.nodes.intake.warning_decoders import (
-    CloudDecoder,
-    OdometryDecoder,
-    TagDecoder,
-)
 from slam_observer_ros.nodes.message_classes import is_installed, message_class
-from slam_observer_ros.settings.input_settings import AUTO, ON_TF, POSE_DIFFERENCES
-from slam_observer_ros.settings.message_types import message_types, Role
+from slam_observer_ros.settings.input_settings import (
+    AUTO,
+    message_types,
+    ON_TF,
+    POSE_DIFFERENCES,
+    Role,
+)
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 
@@ -99,3 +117,108 @@ def _qos(reliability: str, depth: int) -> QoSProfile:
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,
     )
+
+
+MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero
+WITHOUT_TAG_S = 20.0  # time without any fiducial on /tf after which their names may be others
+
+
+class CloudDecoder:
+    """Decodes clouds of a type; warns once if their points have no ids.
+
+    These are then distinguished by their positions, as is wanted, or as a name is misspelt.
+    """
+
+    def __init__(self, node: Node, message_type: str) -> None:
+        self._node = node
+        self._message_type = message_type
+        self._decode: Decode[ObservationEvent] = decoders('landmarks')[message_type]
+        self._is_checked = False
+
+    def __call__(self, raw: Buffer, receive_ns: int) -> ObservationEvent:
+        """Decode a cloud."""
+        event = self._decode(raw, receive_ns)
+        if not self._is_checked and len(event.ids) and (event.ids == UNKNOWN_ID).all():
+            self._is_checked = True
+            self._check(raw)
+        return event
+
+    def _check(self, raw: Buffer) -> None:
+        names = read_fields(raw, self._message_type).names
+        missing = missing_ids(names, self._message_type)
+        if missing:
+            topic = self._node.resolve_topic_name('landmarks')
+            self._node.get_logger().warning(
+                f"points on '{topic}' come {missing}: they are distinguished by where they are; "
+                f"if they have ids, name these '{ID_NAME}'"
+            )
+
+
+class OdometryDecoder:
+    """Decodes velocities of odometries; warns once if these are not those of their poses.
+
+    Attributes
+    ----------
+    doubt : Finding or None
+        What is wrong with them; None until it is seen, and, where all were zero, once one is not.
+
+    """
+
+    def __init__(self, node: Node, uses_turn: bool = True) -> None:
+        self._node = node
+        self._topic = node.resolve_topic_name('twist')
+        self._gives_velocities = False
+        self._check = OdometryCheck(uses_turn)
+        self.doubt: Finding | None = None
+        self._first: FloatArray | None = None
+
+    def __call__(self, raw: Buffer, receive_ns: int) -> VelocityEvent:
+        """Decode the velocity of a nav_msgs/Odometry."""
+        pose, velocity = decode_odometry(raw)
+        if not self._gives_velocities:
+            self._look_for_velocities(pose, velocity)
+        elif not self._check.is_decided:
+            self._check.add(pose, velocity)
+            if self._check.problem:
+                self._warn('wrong_twist', problem=self._check.problem)
+        return velocity
+
+    def _look_for_velocities(self, pose: PoseMessage, event: VelocityEvent) -> None:
+        # One that has given a velocity will do so again.
+        self._gives_velocities = bool(event.body_velocity.any())
+        if self._gives_velocities:
+            self.doubt = None
+        if self._gives_velocities or self.doubt or pose.problem:  # nobody asked for its pose
+            return
+        if self._first is None:
+            self._first = pose.position
+        if np.linalg.norm(pose.position - self._first) > MOVED_M:
+            self._warn('zero_twist')
+
+    def _warn(self, kind: str, **figures: object) -> None:
+        self.doubt = found(kind, topic=f"'{self._topic}'", **figures)
+        self._node.get_logger().warning(self.doubt.text())
+
+
+class TagDecoder:
+    """Decodes fiducials on /tf, and warns once if no frame is named as they are."""
+
+    def __init__(self, node: Node, tag_frame_prefix: str) -> None:
+        self._node = node
+        self._prefix = tag_frame_prefix
+        self._warn_at_s = time.monotonic() + WITHOUT_TAG_S
+        self._is_checked = False
+        self._frames: set[str] = set()
+
+    def __call__(self, raw: Buffer, _receive_ns: int) -> list[ObservationEvent]:
+        """Decode what of a tf2_msgs/TFMessage are sightings of fiducials."""
+        transforms = decode_transforms(raw)
+        seen = observed_tags(transforms, self._prefix)
+        self._is_checked = self._is_checked or bool(seen)
+        if not self._is_checked:
+            self._frames |= {transform.child_frame_id for transform in transforms}
+            if time.monotonic() > self._warn_at_s:
+                self._is_checked = True
+                reason = no_tags(self._prefix, self._frames)
+                self._node.get_logger().warning(f'no fiducial seen so far: {reason}')
+        return seen

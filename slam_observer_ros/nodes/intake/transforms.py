@@ -9,13 +9,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 
 from slam_observer_ros.common.errors import MessageError, TransformError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import insert_transforms
-from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
+from slam_observer_ros.inputs.frames import ALWAYS_NS, insert_transforms, TransformBuffer
 from slam_observer_ros.messages.poses import decode_transforms
+from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.input_topic import take
-from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
@@ -82,7 +82,8 @@ class LiveTransforms:
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
-                self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
+                finding = found('malformed_message', topic=f"'{topic}'", error=error)
+                self._log.warning(topic, finding.text())
                 return
             if self._sent is not None and not is_static:
                 for each in transforms:

@@ -16,7 +16,7 @@ from visualization_msgs.msg import MarkerArray
 from slam_observer_ros.common.stamps import is_due, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
+from slam_observer_ros.inputs.frames import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.clouds import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import (
     EstimateMessages,
@@ -25,8 +25,8 @@ from slam_observer_ros.messages.estimate_messages import (
     uncertain_pose,
 )
 from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.input_topic import rivals
-from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import (
     LATCHED_POSE_QOS,
     LATCHED_QOS,

@@ -12,9 +12,9 @@ from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.messages.estimate_messages import encode_transform
-from slam_observer_ros.nodes.logs import ThrottledLog
+from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.message_classes import RELIABLE_QOS, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -1,26 +1,41 @@
-"""Poses that a person or another node gives to the observer."""
+"""Poses that people or other nodes give to the observer, and the last one kept over a restart."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+import time
+from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from rclpy.node import Node
+import yaml
 
-from slam_observer_ros.common.errors import MessageError, ParameterError
+from slam_observer_ros.common.errors import (
+    MapError,
+    MessageError,
+    ParameterError,
+    SlamObserverError,
+    YamlError,
+)
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import are_covariances, limited
-from slam_observer_ros.messages.poses import (
-    decode_pose_with_covariance_stamped,
-    PoseMessage,
-)
+from slam_observer_ros.known_map.landmark_map import MAX_NUMBER
+from slam_observer_ros.messages.poses import decode_pose_with_covariance_stamped, PoseMessage
+from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.clocks import FUTURE_NS
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.message_classes import RELIABLE_QOS
+from slam_observer_ros.nodes.services.map_services import absolute, is_there
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.state.covariances import MAX_POSE_ERRORS, of_moved_pose
 
 TOPICS = ('initialpose', '~/set_pose')
@@ -108,3 +123,133 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
         )
     assumed: FloatArray = np.where(np.diagonal(given) == 0.0, GIVEN_POSE_STD**2, 0.0)
     return limited(given, MAX_POSE_ERRORS) + np.diag(assumed)
+
+
+class KeptPose:
+    """Starts where the robot was when the node ended, unless that was too long ago.
+
+    What can't be read or written is a warning: the robot is localised without it, too.
+    """
+
+    def __init__(self, node: Node, settings: ObserverNodeSettings, estimator: Estimator) -> None:
+        self._log = ThrottledLog(node)
+        self._logger = node.get_logger()
+        self._settings = settings
+        self._estimator = estimator
+        self._path = absolute(settings.pose_file) if settings.pose_file else None
+        self._stamp_ns: int | None = None
+
+    def restore(self) -> None:
+        """Set the robot to the kept pose, if there is one that may be right."""
+        if self._path is None or not is_there(self._path):
+            return
+        try:
+            stored = read_pose(self._path)
+            reason = self._reason_against(stored)
+            if not reason:
+                # It may have been moved a little meanwhile, as a pose given in RViz may be off.
+                covariance = stored.covariance + np.diag(GIVEN_POSE_STD**2)
+                self._estimator.set_pose(stored.pose, covariance)
+        except SlamObserverError as error:
+            reason = str(error)
+        if reason:
+            self._logger.warning(f'the pose kept in pose_file is not used: {reason}')
+            return
+        x, y, z = stored.pose[:3, 3].tolist()
+        self._logger.info(f'the robot is where it was: ({x:.2f}, {y:.2f}, {z:.2f}) m')
+
+    def keep(self) -> None:
+        """Write the present pose, if it is known and new."""
+        estimator = self._estimator
+        stamp_ns = estimator.stamp_ns
+        is_known = estimator.is_localised and stamp_ns not in (None, self._stamp_ns)
+        if self._path is None or not is_known:
+            return
+        pose, covariance = estimator.uncertain_pose
+        if covariance is None:
+            covariance = np.zeros((6, 6))
+        frame = self._settings.map_frame
+        self._stamp_ns = stamp_ns
+        try:
+            write_pose(self._path, StoredPose(pose, covariance, frame, time.time()))
+        except SlamObserverError as error:
+            self._log.warning('pose_file', str(error))
+
+    def _reason_against(self, stored: StoredPose) -> str:
+        age_s = time.time() - stored.time_s
+        if age_s < 0.0:
+            return f"by this machine's clock it was kept {-age_s:.0f} s from now"
+        if age_s > self._settings.pose_file_max_age:
+            return f'it is {age_s:.0f} s old (pose_file_max_age)'
+        if stored.frame_id != self._settings.map_frame:
+            return f"it is in frame '{stored.frame_id}', not '{self._settings.map_frame}'"
+        return ''
+
+
+FORMAT = 'slam_observer_ros pose'
+MAX_BYTES = 10_000
+SIZES = {'position': 3, 'orientation': 4, 'covariance': 36}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredPose:
+    """Where the robot was, and when, by the system's clock."""
+
+    pose: FloatArray  # (4, 4) in frame_id
+    covariance: FloatArray  # (6, 6) of rotation vector and position along the map's axes
+    frame_id: str
+    time_s: float  # since 1970
+
+
+def write_pose(path: Path, stored: StoredPose) -> None:
+    """Write the file whole, or not at all; MapError if it can't be written."""
+    content = {
+        'format': FORMAT,
+        'frame': stored.frame_id,
+        'time': stored.time_s,
+        'position': stored.pose[:3, 3].tolist(),
+        'orientation': so3.to_quaternion(stored.pose[:3, :3]).tolist(),
+        'covariance': stored.covariance.ravel().tolist(),
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with unfinished_file(path) as file:
+            yaml.safe_dump(content, file, sort_keys=False)
+    except OSError as error:
+        raise MapError(f"can't write the pose {path}: {error.strerror}") from error
+
+
+def read_pose(path: Path) -> StoredPose:
+    """Read the file; MapError if it can't be read, or is no such file."""
+    try:
+        content = load_yaml(path, MAX_BYTES, plain_value)
+    except OSError as error:
+        raise MapError(f"can't read the pose {path}: {error.strerror}") from error
+    except YamlError as error:
+        raise MapError(f'the pose {path} is not valid YAML: {error}') from error
+    if not isinstance(content, dict) or content.get('format') != FORMAT:
+        raise MapError(f"{path} has no line 'format: {FORMAT}'")
+    values = {name: _numbers(path, content, name, size) for name, size in SIZES.items()}
+    (time_s,) = _numbers(path, {'time': [content.get('time')]}, 'time', 1)
+    quaternion = values['orientation']
+    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
+        raise MapError(f"the pose {path}: 'orientation' is no unit quaternion")
+    rotation = so3.from_quaternion(quaternion)
+    return StoredPose(
+        se3.pose(rotation, values['position']),
+        values['covariance'].reshape(6, 6),
+        str(content.get('frame')),
+        float(time_s),
+    )
+
+
+def _numbers(path: Path, content: dict[str, Any], name: str, size: int) -> FloatArray:
+    written = content.get(name)
+    numbers = written if isinstance(written, list) else []
+    # NaN is within no bounds, and an int may have more digits than any array takes.
+    are_usable = all(type(each) in (int, float) and abs(each) <= MAX_NUMBER for each in numbers)
+    if len(numbers) != size or not are_usable:
+        raise MapError(
+            f"the pose {path}: '{name}' is not {size} finite numbers, {MAX_NUMBER:g} at most"
+        )
+    return np.array(numbers, dtype=np.float64)

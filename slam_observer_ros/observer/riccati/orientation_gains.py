@@ -23,7 +23,7 @@ from slam_observer_ros.observer.orientations import (
     SeenOrientations,
 )
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.robust import distances, observation_weights
+from slam_observer_ros.observer.robust import accepted, distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 
 
@@ -107,7 +107,7 @@ class OrientationGains(Gains):
         known, R = rows[own], R[own]
         omega = self.axes.turns(so3.log(self.observer.orientations.B[known] @ transpose(B[own])))
         near = mahalanobis(omega, self.joint.own_turns(known) + R)
-        agree = near <= self._settings.rejection_threshold
+        agree = accepted(near, self._settings.rejection_threshold)
         if agree.any():
             self.joint.activate(known[agree])
             HP, HPH = self.joint.project_own_turns(known[agree])
@@ -159,7 +159,7 @@ class OrientationGains(Gains):
         omega = self.axes.turns(so3.log(tags.B[rows] @ transpose(tags.B[copies])))
         R = RESOLUTION_RAD**2 * np.tile(np.eye(self.axes.turn), (len(rows), 1, 1))
         near = distances(omega, self.joint.project_turn_differences(rows, copies)[1], R)
-        agree = near <= self._settings.rejection_threshold
+        agree = accepted(near, self._settings.rejection_threshold)
         if agree.any():
             HP, HPH = self.joint.project_turn_differences(rows[agree], copies[agree])
             S = with_blocks(HPH, R[agree])

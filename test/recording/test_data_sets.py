@@ -10,13 +10,13 @@ import scipy.io
 from slam_observer_ros.common.errors import DataSetError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.graph_files import load_graph
-from slam_observer_ros.recording.mrclam import load_mrclam
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.starry_night import (
+from slam_observer_ros.recording.data_sets import (
     EPOCH_NS,
+    load_mrclam,
     load_starry_night,
 )
+from slam_observer_ros.recording.graph_files import load_graph
+from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.writer import DataSet, write_data_set
 
 SECOND_NS = 1_000_000_000

@@ -2,8 +2,8 @@
 
 The paper writes A p̄ for points and A v⃗ for directions; here these are `se3.transform` and
 `se3.rotate`. All functions take n = 0, 1 or many landmarks and any leading axes; metres, rad, s.
-Of these the package only uses `exp`, at each correction by Riccati gains that map. The rest is
-what the paper states; tests hold :class:`slam_observer_ros.observer.observer.Observer` against it.
+The package only uses `exp`, at each correction by Riccati gains that map. The rest is what the
+paper states; tests hold :class:`slam_observer_ros.observer.observer.Observer` against it.
 """
 
 from __future__ import annotations
@@ -14,16 +14,9 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.observer.chart import slam_exp, SlamElement
 
-_IDENTITY = np.eye(3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SlamElement:
-    """Element X = (A, a_1, …, a_n) of SLAM_n(3), or a stack of them: a pose and translations."""
-
-    A: FloatArray  # (…, 4, 4)
-    a: FloatArray  # (…, n, 3)
+exp = slam_exp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,21 +63,6 @@ def inverse(X: SlamElement) -> SlamElement:
     """Inverse (A, a_i)⁻¹ = (A⁻¹, −R_{A⁻¹} a_i) (22)."""
     A_inverse = se3.inverse(X.A)
     return SlamElement(A_inverse, -se3.rotate(A_inverse, X.a))
-
-
-def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
-    """Group exponential (exp Δ, J(Ω_Δ) d_i), with the left Jacobian J of SO(3).
-
-    With held body velocity and landmark velocities, `compose(X, exp(V dt, v dt))` solves the
-    lifted kinematics exactly over dt.
-    """
-    phi, v = Delta[..., :3], Delta[..., 3:]
-    K, J = so3.hat(phi), so3.left_jacobian(phi)
-    # exp φ = I + K J, as J is the integral of exp(s φ).
-    if Delta.ndim == 1:  # as at each correction, at half the cost
-        return SlamElement(se3.pose(_IDENTITY + K.dot(J), J.dot(v)), d.dot(J.T))
-    R = _IDENTITY + K @ J
-    return SlamElement(se3.pose(R, (J @ v[..., None])[..., 0]), d @ J.swapaxes(-1, -2))
 
 
 def alpha(S: FloatArray, Xi: TotalState) -> TotalState:

@@ -10,9 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import slam_group
+from slam_group import TotalState
+
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, slam_group, so3
-from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.observer.chart import SlamElement
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,12 @@ from strategies import poses
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import insert_transforms
-from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
+from slam_observer_ros.inputs.frames import (
+    ALWAYS_NS,
+    HISTORY_NS,
+    insert_transforms,
+    TransformBuffer,
+)
 from slam_observer_ros.messages.poses import decode_transforms
 
 NO_TURN = [0.0, 0.0, 0.0, 1.0]

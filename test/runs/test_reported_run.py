@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from recordings import events
 
-from slam_observer_ros.runs import recorder as recorder_module
-from slam_observer_ros.runs.recorder import RunRecorder
+from slam_observer_ros.runs import reported_run as recorder_module
 from slam_observer_ros.runs.replay import replay
+from slam_observer_ros.runs.reported_run import RunRecorder
 from slam_observer_ros.settings.estimator_settings import Settings
 
 
