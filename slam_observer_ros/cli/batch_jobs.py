@@ -27,11 +27,11 @@ from typing import Any
 from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import kept_warnings
 from slam_observer_ros.cli.options import parse_value
+from slam_observer_ros.cli.replay import as_json, identity, summary_rows
 from slam_observer_ros.cli.replay_files import write_report_of
 from slam_observer_ros.cli.replay_outcome import with_logged
 from slam_observer_ros.cli.replay_request import Records, ReplayRequest
 from slam_observer_ros.cli.replay_run import replayed
-from slam_observer_ros.cli.replay_summary import as_json, identity, summary_rows
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError, shown, UsageError
 from slam_observer_ros.common.files import not_special, unfinished_file

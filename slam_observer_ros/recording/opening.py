@@ -13,8 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from slam_observer_ros.common.errors import message_of, RecordingError, YamlError
-from slam_observer_ros.common.files import not_special
-from slam_observer_ros.common.yaml_files import load_yaml, plain_value
+from slam_observer_ros.common.files import load_yaml, not_special, plain_value
 from slam_observer_ros.recording.mcap_source import McapSource
 from slam_observer_ros.recording.sources import (
     BagSource,

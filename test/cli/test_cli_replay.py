@@ -18,7 +18,7 @@ from tum_files import read_tum
 import yaml
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.evaluation.run_record import PoseTruth
+from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.simulation import Scenario, Simulation

@@ -23,7 +23,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.timeline import MAX_PENDING_VELOCITIES, Timeline
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.evaluation.run_record import PoseTruth
+from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     FIRST_AUTOMATIC_ID,

@@ -16,7 +16,7 @@ import ros_messages as ros
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.common.errors import RecordingError
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.poses import PoseBlock, PoseMessage
 from slam_observer_ros.recording.reader import Recording
