@@ -47,7 +47,7 @@ from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import in_parts, usual
-from slam_observer_ros.state.matching import corrected, match
+from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, step
 from slam_observer_ros.state.usual import Outcome
@@ -260,13 +260,13 @@ class Hypotheses:
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         if self.best.errors is None:
             return self._observe_alone(event)
-        if len(self._all) == 1 and not unknown:
-            matched = match(self.best, event)
+        matched = match(self.best, event) if len(self._all) == 1 else None
+        if matched is not None and not unknown:
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matched)
             if is_clear and not may_relabel(self.best, matched):
                 return step(self.best, matched)
         # All hypotheses with all meanings; costs are over that of the most likely one.
-        children = self._follow(event, self._interpret(event))
+        children = self._follow(event, self._interpret(event, matched))
         least_cost = children[0].hypothesis.cost
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:
@@ -315,7 +315,7 @@ class Hypotheses:
         state, outcome = hypothesis.state, taken.outcome
         if outcome is None:
             state.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
-            outcome = step(state, match(state, taken.event))
+            outcome = step(state, taken.matched or match(state, taken.event))
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
@@ -325,11 +325,13 @@ class Hypotheses:
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
         return _Child(hypothesis, taken.event, outcome)
 
-    def _interpret(self, event: ObservationEvent) -> list[tuple[int, Interpretation]]:
+    def _interpret(
+        self, event: ObservationEvent, matched: MatchedObservation | None
+    ) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.
 
         The cost is that of the hypothesis as well. A point has the same id in all of them that
-        take it for a new landmark.
+        take it for a new landmark. ``matched`` is what a single hypothesis has made of it.
         """
         new_ids, margin = self._new_ids(len(event.ids)), pruning_cost(event.ids)
         gate_cost = unpaired_cost(self.best.settings.rejection_threshold)
@@ -338,7 +340,8 @@ class Hypotheses:
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, hypothesis in enumerate(self._all):
             cost = hypothesis.cost
-            for taken in self._meanings(hypothesis, event, new_ids, new_cost, worst - cost):
+            budget = worst - cost
+            for taken in self._meanings(hypothesis, event, matched, new_ids, new_cost, budget):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
@@ -348,6 +351,7 @@ class Hypotheses:
         self,
         hypothesis: Hypothesis,
         event: ObservationEvent,
+        matched: MatchedObservation | None,
         new_ids: IntArray,
         new_cost: float,
         budget: float,
@@ -356,18 +360,16 @@ class Hypotheses:
 
         Of several, one that contradicts what it said before is given up, unless it is the best.
         """
-        state, is_alone = hypothesis.state, len(self._all) == 1
+        state, index = hypothesis.state, hypothesis.index
         seen = corrected(state, event)
-        used = None if is_alone else in_parts.observe(state, event, is_weighed=True)
+        if matched is not None:
+            return interpretations(state, index, seen, matched, new_ids, new_cost, budget, True)
+        used = in_parts.observe(state, event, is_weighed=True)
         if used is not None:
             found = [as_its_ids_say(state, seen, used)]
         else:
-            matched, index = match(state, seen), hypothesis.index
-            found = interpretations(
-                state, index, seen, matched, new_ids, new_cost, budget, is_alone
-            )
-        if is_alone:
-            return found
+            matched = match(state, seen)
+            found = interpretations(state, index, seen, matched, new_ids, new_cost, budget)
         agreeing = consistent(hypothesis.verdicts, state, found, event)
         return found if not agreeing and hypothesis is self._all[0] else agreeing
 

@@ -55,6 +55,7 @@ class Interpretation:
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
+    matched: MatchedObservation | None = None  # with the landmarks of these ids, where it is so
     outcome: Outcome | None = None  # where the state has already used it so
 
 
@@ -92,7 +93,8 @@ def interpretations(
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
     else:
-        trusting, slipped = Interpretation(event, pairing_cost(state, m, residuals)), []
+        cost = pairing_cost(state, m, residuals)
+        trusting, slipped = Interpretation(event, cost, matched=matched), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
     without = [_without(ids, state, matched, trusting) for ids in doubted]
     return _of_suspects([trusting, *without, *slipped], suspects)
@@ -104,10 +106,11 @@ def _of_suspects(found: list[Interpretation], suspects: IntArray) -> list[Interp
 
 def as_its_ids_say(state: State, event: ObservationEvent, outcome: Outcome) -> Interpretation:
     """Return the only meaning of an observation that a state has used as usual."""
-    weighed, m = outcome.weighed, len(event.ids)
+    expected, m = outcome.expected, len(event.ids)
     cost = m * outlier_cost(state)
-    if weighed is not None:
-        cost = joint_cost(*weighed) + (m - len(weighed.r)) * outlier_cost(state)
+    if expected is not None:
+        paired_cost = joint_cost(expected.r, expected.S, expected.R)
+        cost = paired_cost + (m - len(expected.r)) * outlier_cost(state)
     return Interpretation(event, cost, outcome=outcome)
 
 
@@ -209,14 +212,15 @@ def _rejected_or_slipped(
     cost, is_new_cause = rejection_cost(state, matched, rejected)
     accepted_cost = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
     after_slip = _after_slip(state, matched, event) if is_new_cause else None
+    rejecting = Interpretation(event, accepted_cost + cost, matched=matched)
     if after_slip is None:
-        return [Interpretation(event, accepted_cost + cost)]
+        return [rejecting]
     if state.was_contradicted:
-        return [Interpretation(event, accepted_cost + cost), after_slip]
+        return [rejecting, after_slip]
     as_outliers = accepted_cost + float(np.sum(rejected)) * outlier_cost(state)
     # A garbled message also explains points that happen to be where they should be.
     garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
-    return [Interpretation(event, garbled), after_slip]
+    return [replace(rejecting, cost=garbled), after_slip]
 
 
 def _after_slip(
@@ -228,11 +232,11 @@ def _after_slip(
         return None
     slipped = state.copy()
     cost = slip(slipped, matched)
-    residuals = match(slipped, event).residuals
-    if _are_rejected(slipped, residuals).any():
+    matched = match(slipped, event)
+    if _are_rejected(slipped, matched.residuals).any():
         return None
-    cost += SLIP_COST + pairing_cost(slipped, len(event.ids), residuals)
-    return Interpretation(event, cost, slipped)
+    cost += SLIP_COST + pairing_cost(slipped, len(event.ids), matched.residuals)
+    return Interpretation(event, cost, slipped, matched=matched)
 
 
 def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:

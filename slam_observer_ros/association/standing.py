@@ -8,20 +8,29 @@ carries them along: these are not places.
 
 from __future__ import annotations
 
-from collections.abc import Set
 from dataclasses import dataclass, field, replace
-from functools import reduce
 import math
 
 import numpy as np
 from scipy.linalg import block_diag
 
+from slam_observer_ros.association.looks import (
+    CLEAR,
+    ids_of,
+    LEAST,
+    Look,
+    NOISE,
+    Pairs,
+    product,
+    sensor_noise,
+    SLIPS,
+    View,
+)
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
-from slam_observer_ros.sensor_models.integration import integrate
+from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.state import State
@@ -32,18 +41,6 @@ TEST_NS, LONGEST_WAIT_NS = to_ns(0.25), to_ns(1.0)
 LAST_TEST_NS = to_ns(15.0)
 """For how long it is compared with the same look, where it passes slowly."""
 
-SLIPS = (np.zeros(6), np.repeat([1.0, 0.0], 3))
-"""Shares (6,) of a motion that are made where wheels spin: nothing, or the turn alone."""
-
-NOISE = 3.0
-"""Standard deviations of what a sensor says, within which a landmark is where it should be."""
-
-MOVED = 2.0
-"""Standard deviations from which on a landmark has hardly stood still."""
-
-CLEAR = 6.0
-"""Standard deviations from which on a motion, or a shift in the robot's frame, is clear."""
-
 USUAL = 4.0
 """Standard deviations, in the mean, with which it is quickly seen what passes."""
 
@@ -52,12 +49,6 @@ FORGOTTEN = 0.95
 
 CERTAIN = 2.0 * CLEAR**2
 """Evidence with which a landmark is carried, at most: two looks or more, −2 ln of a likelihood."""
-
-LEAST = 2
-"""Landmarks that must agree on a slip: one alone may move as the robot does."""
-
-MOST = 0.75
-"""Share of the landmarks in view that stands for all of them: some points are false."""
 
 TOGETHER_NS = to_ns(0.25)
 """Observations of few landmarks each, or of several sensors, are one look for so long.
@@ -73,125 +64,6 @@ MAX_MOTIONS = 500
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
-    """An observation, and how many of the moves that are remembered were before it."""
-
-    event: ObservationEvent
-    moves: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Pairs:
-    """Landmarks (m,) that a sensor has seen twice, and points (m, 3) of theirs, body frame."""
-
-    event: ObservationEvent  # the later one …
-    rows: list[int]  # … and which of its points these are
-    ids: list[int]
-    before: FloatArray
-    points: FloatArray
-    expected: FloatArray  # where odometry has them
-    motion: FloatArray  # (4, 4) in between, by odometry
-    since_ns: int
-
-    @classmethod
-    def of(cls, start: _Look, now: _Look, moved: list[FloatArray], but: Set[int]) -> _Pairs:
-        """Return those of two looks, ``but`` some.
-
-        In between the robot has ``moved`` by odometry.
-        """
-        first = {i: row for row, i in enumerate(start.event.ids.tolist()) if i not in but}
-        both = [(row, i) for row, i in enumerate(now.event.ids.tolist()) if i in first]
-        rows, ids = [row for row, _ in both], [i for _, i in both]
-        before = start.event.points[[first[i] for i in ids]]
-        motion = _product(moved)
-        expected = (before - motion[:3, 3]).dot(motion[:3, :3])
-        points = now.event.points[rows]
-        return cls(now.event, rows, ids, before, points, expected, motion, start.event.stamp_ns)
-
-    @property
-    def lagging(self) -> list[int]:
-        """Landmarks that have not gone half of the way that they should have gone."""
-        way, made = self.expected - self.before, self.points - self.before
-        ahead = np.einsum('ij,ij->i', made - 0.5 * way, way).tolist()
-        return [i for i, much in zip(self.ids, ahead, strict=True) if much <= 0.0]
-
-    @property
-    def squared_way(self) -> float:
-        """Sum of the squares of the ways that they should have gone, m²."""
-        way = (self.expected - self.before).ravel()
-        return float(way.dot(way))
-
-    def after(self, share: FloatArray) -> FloatArray:
-        """Return where (m, 3) they should be if a ``share`` (6,) of the motion was made."""
-        back = se3.exp(-share * se3.log(self.motion))
-        return se3.transform(back, self.before)
-
-
-@dataclass(frozen=True, slots=True)
-class _View:
-    """What landmarks (m,) have done in the robot's frame, in standard deviations."""
-
-    ids: list[int]
-    shift: FloatArray  # from where each was
-    way: FloatArray  # by odometry, which may be off as well
-    error: FloatArray  # from where that has it
-    slipped: FloatArray  # (s, m) from where each of the SLIPS has it
-    off: FloatArray  # (m, k) the error in metres, body frame
-    noise: FloatArray  # (m, k, k) of the sensor in both observations, m²
-    C: FloatArray  # (m, k, p) how the motion's error moves each
-    motion_noise: FloatArray  # (p, p)
-
-    @classmethod
-    def of(cls, state: State, seen: list[_Pairs], velocities: VelocityHistory) -> _View:
-        """Return what pairs of points of one sensor or several show."""
-        k, A = state.axes.point, state.observer.A
-        noise = _noise(state, seen)
-        now = np.concatenate([pairs.points for pairs in seen])
-        before = np.concatenate([pairs.before for pairs in seen])
-        expected = np.concatenate([pairs.expected for pairs in seen])
-        slipped = [np.concatenate([pairs.after(share) for pairs in seen]) for share in SLIPS]
-        shifts = (now - np.array([before, *slipped]))[:, :, :k]
-        squared = np.einsum('smi,mij,smj->sm', shifts, np.linalg.inv(noise), shifts)
-        shift, *slips = np.sqrt(np.maximum(squared, 0.0))
-        C = transpose(A[:k, :k]) @ state.axes.output_matrix(se3.transform(A, expected))
-        longest = min(seen, key=lambda pairs: pairs.since_ns)
-        motion_noise = _motion_noise(state, longest, velocities)
-        S, way = noise + C @ motion_noise @ transpose(C), (expected - before)[:, :k]
-        off = (now - expected)[:, :k]
-        error, way = mahalanobis(off, S), mahalanobis(way, S)
-        ids = [landmark_id for pairs in seen for landmark_id in pairs.ids]
-        return cls(ids, shift, way, error, np.array(slips), off, noise, C, motion_noise)
-
-    @property
-    def passes(self) -> BoolArray:
-        """Which (m,) are clearly elsewhere, and nearer to where odometry has them."""
-        return (self.shift > CLEAR) & (2.0 * self.error < self.shift)
-
-    @property
-    def is_mixed(self) -> bool:
-        """Whether most have neither stood nor gone as odometry says."""
-        neither = (self.shift > MOVED) & (self.error > NOISE)
-        return bool(2 * np.count_nonzero(neither) > len(neither))
-
-    def shows(self, slipped: FloatArray, places: BoolArray) -> bool:
-        """Return whether places say so of a slip that has landmarks ``slipped`` (m,) off.
-
-        And clearly so, beside what odometry may be off by.
-        """
-        gain, agree = self.error**2 - slipped**2, places & (slipped <= NOISE)
-        differ = places & (slipped > NOISE) & (gain < -(NOISE**2))
-        if (
-            np.count_nonzero(agree & (gain > NOISE**2)) < LEAST
-            or np.count_nonzero(agree) < MOST * np.count_nonzero(places)
-            or differ.any()
-        ):
-            return False
-        C, off = self.C[agree].reshape(-1, self.C.shape[-1]), self.off[agree].ravel()
-        S = with_blocks(C @ self.motion_noise @ C.T, self.noise[agree])
-        return bool(off @ np.linalg.solve(S, off) - np.sum(slipped[agree] ** 2) > CLEAR**2)
-
-
-@dataclass(frozen=True, slots=True)
 class Lost:
     """What odometry says of a motion that was not made."""
 
@@ -201,7 +73,20 @@ class Lost:
 
 @dataclass(slots=True)
 class Standing:
-    """Whether the robot stands while its wheels spin, and which landmarks it carries along."""
+    """Whether the robot stands while its wheels spin, and which landmarks it carries along.
+
+    It compares observations that are due with an earlier one, the start. Its states:
+
+    ============ =================== ========================================================
+    ``_starts``  ``slip``            what the next observation does
+    ============ =================== ========================================================
+    none         None                becomes the start (:meth:`_begin`)
+    one a sensor None                is compared with it; once it is clear what has passed, a
+                                     new start is made, or a slip begins (:meth:`_test`)
+    one a sensor a row of the SLIPS  is compared with what that slip expects; where too few
+                                     agree, it is over, and a new start made (:meth:`_go_on`)
+    ============ =================== ========================================================
+    """
 
     carried: set[int] = field(default_factory=set)
     excluded: set[int] = field(default_factory=set)  # landmarks that are carried, or may be
@@ -211,9 +96,9 @@ class Standing:
     sensor_frame: str = ''  # an observation is due from another one, …
     due_ns: int = 0  # … or from here on
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
-    _starts: list[_Look] = field(default_factory=list)  # what is compared with, …
-    _latest: list[_Look] = field(default_factory=list)  # … and what is
-    _tested: list[_Look] = field(default_factory=list)  # the latest when that was judged
+    _starts: list[Look] = field(default_factory=list)  # what is compared with, …
+    _latest: list[Look] = field(default_factory=list)  # … and what is
+    _tested: list[Look] = field(default_factory=list)  # the latest when that was judged
     _test_ns: int = 0
     _wait_ns: int = TEST_NS  # until so much has passed that it is clear
     _odd: set[int] = field(default_factory=set)  # what did not pass as it should have
@@ -238,7 +123,7 @@ class Standing:
         """
         if event.velocities is not None:
             return None  # landmarks may move as the robot does
-        look, lost = _Look(event, len(self.moved)), None
+        look, lost = Look(event, len(self.moved)), None
         if self.slip is not None:
             lost = self._go_on(state, look)
         elif not self._starts:
@@ -264,31 +149,29 @@ class Standing:
             return False
         return event.stamp_ns - self._starts[0].event.stamp_ns < TOGETHER_NS // 2
 
-    def _begin(self, look: _Look) -> None:
+    def _begin(self, look: Look) -> None:
         """Compare with this observation from now on."""
         event = look.event
         self.sensor_frame = event.sensor_frame
-        self._starts, self._latest = [_Look(event, 0)], []
+        self._starts, self._latest = [Look(event, 0)], []
         self._earlier, self.moved = self.moved, []
         self._tested, self._enough_m2 = [], self._usual_m2
         more_ns = 0 if len(event.ids) >= LEAST else TOGETHER_NS // 2
         self._test_ns = event.stamp_ns + self._wait_ns + more_ns
 
-    def _test(self, state: State, look: _Look, velocities: VelocityHistory) -> Lost | None:
+    def _test(self, state: State, look: Look, velocities: VelocityHistory) -> Lost | None:
         """Look for a slip, and for landmarks that are carried along."""
         event = look.event
         age_ns = event.stamp_ns - self._starts[0].event.stamp_ns
-        if len(_ids(self._latest) & _ids(self._starts)) < LEAST:
+        if len(ids_of(self._latest) & ids_of(self._starts)) < LEAST:
             if len(event.ids) >= LEAST or age_ns > UNSEEN_NS:  # else more may follow
                 self._begin(look)
             return None
         seen = self._pairs()
-        ids = [i for pairs in seen for i in pairs.ids]
         tested, self._tested = self._tested, list(self._latest)
+        ids = [i for pairs in seen for i in pairs.ids]
         way_m2 = sum(pairs.squared_way for pairs in seen) / max(len(ids), 1)
-        needed = math.sqrt(self._usual_m2 / way_m2) if way_m2 else math.inf
-        self._wait_ns = int(min(max(needed * age_ns, TEST_NS), LONGEST_WAIT_NS))
-        self._test_ns = event.stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
+        self._wait(event.stamp_ns, age_ns, way_m2)
         if way_m2 <= self._enough_m2:
             if age_ns > LAST_TEST_NS:
                 self._begin(look)
@@ -298,15 +181,11 @@ class Standing:
             self._usual_m2 *= FORGOTTEN
             self._begin(look)
             return None
-        view = _View.of(state, seen, velocities)
+        view = View.of(state, seen, velocities)
         self._usual_m2 = way_m2 * USUAL**2 / np.mean(view.way**2)
         self._enough_m2 = 2.0 * way_m2
         if self._slips(state, view):
-            self._agreed = dict.fromkeys(ids, (event.stamp_ns, True))
-            self._starts = self._latest
-            lost = self._lost(self.moved[-1:], self._earlier + self.moved)
-            self.moved = []
-            return lost
+            return self._begin_slip(ids, event.stamp_ns)
         if view.passes.any():
             self._sort(view)
             self._begin(look)
@@ -316,25 +195,39 @@ class Standing:
             return self._test(state, look, velocities)
         return None
 
+    def _wait(self, stamp_ns: int, age_ns: int, way_m2: float) -> None:
+        """Wait with the next test until so much should have passed that it is clear."""
+        needed = math.sqrt(self._usual_m2 / way_m2) if way_m2 else math.inf
+        self._wait_ns = int(min(max(needed * age_ns, TEST_NS), LONGEST_WAIT_NS))
+        self._test_ns = stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
+
+    def _begin_slip(self, ids: list[int], stamp_ns: int) -> Lost:
+        """Compare with what is seen now, by the slip; return what was lost since the last look."""
+        self._agreed = dict.fromkeys(ids, (stamp_ns, True))
+        self._starts = self._latest
+        lost = self._lost(self.moved[-1:], self._earlier + self.moved)
+        self.moved = []
+        return lost
+
     def _is_usual(self, ids: list[int], lagging: set[int]) -> bool:
         """Return whether all passes but for what is carried, and now and then for one more."""
         odd = lagging ^ self.carried.intersection(ids)
         before, self._odd = self._odd, odd
         return 2 * len(odd) < len(ids) and odd.isdisjoint(before)
 
-    def _pairs(self) -> list[_Pairs]:
+    def _pairs(self) -> list[Pairs]:
         """Return what was seen at the start and lately, each landmark once by each sensor."""
         seen, known = [], dict[str, set[int]]()
         for now in reversed(self._latest):
             but = known.setdefault(now.event.sensor_frame, {UNKNOWN_ID})
             for start in self._starts:
                 if start.event.sensor_frame == now.event.sensor_frame:
-                    pairs = _Pairs.of(start, now, self.moved[start.moves : now.moves], but)
+                    pairs = Pairs.of(start, now, self.moved[start.moves : now.moves], but)
                     but.update(pairs.ids)
                     seen += [pairs] if pairs.ids else []
         return seen
 
-    def _slips(self, state: State, view: _View) -> bool:
+    def _slips(self, state: State, view: View) -> bool:
         """Find out whether one of the SLIPS has begun."""
         places = self._are_places(state, view.ids)
         for slip, slipped in enumerate(view.slipped):
@@ -343,15 +236,15 @@ class Standing:
                 return True
         return False
 
-    def _go_on(self, state: State, look: _Look) -> Lost | None:
+    def _go_on(self, state: State, look: Look) -> Lost | None:
         """Return what :meth:`note` does during a slip, or None once it is over."""
         event, made = look.event, self.moved
         self._slip_on(made)
-        self._latest, look = [_Look(event, 0)], _Look(event, 0)
+        self._latest, look = [Look(event, 0)], Look(event, 0)
         new = set(event.ids.tolist())
         for pairs in self._pairs():
             shift = (pairs.points - pairs.before)[:, : state.axes.point]
-            agree = mahalanobis(shift, _noise(state, [pairs])) <= NOISE
+            agree = mahalanobis(shift, sensor_noise(state, [pairs])) <= NOISE
             are_places = self._are_places(state, pairs.ids)
             for i, agrees, is_place in zip(pairs.ids, agree, are_places, strict=True):
                 new.discard(i)
@@ -372,18 +265,18 @@ class Standing:
 
     def _slip_on(self, made: list[FloatArray]) -> None:
         """Move what is compared with by what a slip makes of motions; forget these."""
-        back = se3.exp(-SLIPS[self.slip or 0] * se3.log(_product(made)))
+        back = se3.exp(-SLIPS[self.slip or 0] * se3.log(product(made)))
         self._starts = [
-            _Look(replace(one.event, points=se3.transform(back, one.event.points)), 0)
+            Look(replace(one.event, points=se3.transform(back, one.event.points)), 0)
             for one in self._starts
         ]
         self.moved = []
 
     def _lost(self, made: list[FloatArray], whole: list[FloatArray]) -> Lost:
         """Return what was lost of motions, and may be of others."""
-        share, motion = SLIPS[self.slip or 0], _product(made)
+        share, motion = SLIPS[self.slip or 0], product(made)
         back = se3.inverse(motion).dot(se3.exp(share * se3.log(motion)))
-        return Lost(back, (1.0 - share) * se3.log(_product(whole)))
+        return Lost(back, (1.0 - share) * se3.log(product(whole)))
 
     def _are_places(self, state: State, ids: list[int]) -> BoolArray:
         """Return which landmarks (m,) are at rest, as far as is known."""
@@ -392,7 +285,7 @@ class Standing:
             places &= state.landmarks.rows_of(np.array(ids)) >= 0
         return places
 
-    def _sort(self, view: _View) -> None:
+    def _sort(self, view: View) -> None:
         """Find out which landmarks stand still while others pass."""
         gain = np.clip(view.error**2 - view.shift**2, -(CLEAR**2), CLEAR**2)
         gain[(gain > 0.0) & (view.shift > NOISE)] = 0.0
@@ -402,37 +295,6 @@ class Standing:
         evidence = self._evidence = {i: much for i, much in self._evidence.items() if much}
         self.carried = {i for i, much in evidence.items() if much == CERTAIN or i in self.carried}
         self.excluded = self.carried | {i for i, much in evidence.items() if much >= CLEAR**2}
-
-
-def _ids(looks: list[_Look]) -> set[int]:
-    return {i for look in looks for i in look.event.ids.tolist() if i != UNKNOWN_ID}
-
-
-def _noise(state: State, seen: list[_Pairs]) -> FloatArray:
-    """Return the covariances (m, k, k) of both points of landmarks that stand, m²."""
-    each = [state.observation_noise.covariances(pairs.event)[pairs.rows] for pairs in seen]
-    both: FloatArray = 2.0 * np.concatenate(each)[:, : state.axes.point, : state.axes.point]
-    return both
-
-
-def _product(moved: list[FloatArray]) -> FloatArray:
-    """Return moves, one after the other, as one motion (4, 4), in the frame at their start."""
-    return reduce(np.dot, moved, np.eye(4))
-
-
-def _motion_noise(state: State, pairs: _Pairs, velocities: VelocityHistory) -> FloatArray:
-    """Return the covariance (p, p) of the motion between them, with that of its bias."""
-    calibration, end_ns = state.calibration, pairs.event.stamp_ns
-    # What led there so long ago that it is forgotten was off by as much.
-    since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)
-    start = state.observer.A.dot(se3.inverse(pairs.motion))
-    motion = integrate(velocities, calibration, state.motion_noise, start, since_ns, end_ns, None)
-    longer = (end_ns - pairs.since_ns) / max(end_ns - since_ns, 1)
-    F = longer * motion.sensitivity
-    # As it is stated: what slips and carried landmarks have added to it is no reason to wait.
-    noise = longer / max(1.0, state.motion_noise.factors.applied.max()) * motion.noise
-    total: FloatArray = noise + (F * state.gains.calibration_variances) @ F.T
-    return total
 
 
 def take_back(state: State, lost: Lost) -> None:

@@ -184,9 +184,9 @@ class Material:
             if event.stamp_ns < self.split_ns:
                 estimator.add(event)
         estimator.flush()
-        if not estimator.is_localised:
+        if problem := estimator.localisation_problem:
             raise UsageError(
-                f'{self.path}: the pose in the map was not found: {estimator.localisation_problem}'
+                f'{self.path}: the pose in the map was not found: {problem.what}; {problem.remedy}'
             )
         return estimator, recorder.likelihood
 

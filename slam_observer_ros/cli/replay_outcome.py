@@ -28,12 +28,10 @@ from slam_observer_ros.runs.accuracy import (
 )
 from slam_observer_ros.runs.error_health import of_errors
 from slam_observer_ros.runs.health import (
-    of_calibration,
+    of_estimate,
     of_fit,
     of_left_out,
     of_map,
-    of_mounting,
-    of_noise,
     of_ranges,
     of_rejections,
 )
@@ -187,16 +185,16 @@ def judged(
     outcome: ReplayOutcome,
     recording: Recording,
     inputs: InputSettings,
-    use: Sequence[Finding],
+    unused: Sequence[Finding],
     map_path: Path | None,
 ) -> ReplayOutcome:
-    """Add what is wrong, and log what gives reason to warn; ``use`` is what was of none."""
+    """Add what is wrong, and log warnings; ``unused`` is of inputs of which nothing was used."""
     result, selected = outcome.result, outcome.selected
     findings = [
-        *use,
+        *unused,
         *_of_lost_pose(result, map_path),
         *of_recording(recording, selected, inputs, result),
-        *_of_estimate(outcome),
+        *_of_run(outcome),
         *of_timing(recording, selected),
         *(of_errors(outcome.whole_run) if outcome.whole_run is not None else ()),
     ]
@@ -221,15 +219,13 @@ def _of_lost_pose(result: Replay, map_path: Path | None) -> list[Finding]:
     return [found('lost_pose', path=map_path, seconds=end_s)]
 
 
-def _of_estimate(outcome: ReplayOutcome) -> Iterator[Finding]:
-    """Judge the estimate as /diagnostics does, over the whole run."""
+def _of_run(outcome: ReplayOutcome) -> Iterator[Finding]:
+    """Judge the estimate as /diagnostics does, and what only a whole run shows."""
     result = outcome.result
     estimator, counts = result.estimator, result.estimator.counts
     yield from of_rejections(counts)
-    yield from of_calibration(estimator.calibration)
-    yield from of_mounting(estimator.calibration)
+    yield from of_estimate(estimator)
     yield from of_ranges(result.range_power, estimator.settings.range_is_depth)
-    yield from of_noise(estimator.motion_factors)
     nis = None if outcome.recorder is None else outcome.recorder.mean_nis
     yield from of_fit(None if nis is None else math.sqrt(nis))
     if result.in_known_map and estimator.settings.localization_mode != 'off':

@@ -82,14 +82,14 @@ def _replay(
         with _estimate_writer(records, recording, selected, inputs, map_frame) as writer:
             recorders = [noter for noter in (recorder, writer) if noter is not None]
             result = replay(events, settings, truth, maps or None, needs_poses, recorders)
-            use = list(of_use(recording, selected, inputs, result))
-            _check_used(request, use)
+            unused = list(of_use(recording, selected, inputs, result))
+            _check_used(request, unused)
             if maps:
                 _check_localised(request, result, maps)
             outcome = outcome_of(recording, selected, result, truth, recorder)
             if writer is not None:
                 writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
-        outcome = judged(outcome, recording, inputs, use, request.load_map)
+        outcome = judged(outcome, recording, inputs, unused, request.load_map)
     return with_smoothed(outcome) if request.smooth else outcome
 
 
@@ -173,8 +173,9 @@ def _check_localised(request: ReplayRequest, result: Replay, maps: Sequence[Land
 
 def _never_found(result: Replay, maps: Sequence[LandmarkMap]) -> str:
     estimator = result.estimator
-    if is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses):
-        return f'{estimator.localisation_problem}{_advice(result)}'
+    problem = estimator.localisation_problem
+    if problem and (is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)):
+        return f'{problem.what}{_advice(result)}'
     least = 'two' if estimator.settings.two_d_mode else 'three'
     ids = np.concatenate([known.ids for known in maps])
     named = ids[~is_automatic(ids)]

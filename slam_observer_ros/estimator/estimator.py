@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
@@ -320,8 +321,8 @@ class Estimator:
         return self._localiser.is_localised
 
     @property
-    def localisation_problem(self) -> str:
-        """Why the pose in a loaded map is not known; empty if it is."""
+    def localisation_problem(self) -> Finding | None:
+        """Why the pose in a loaded map is not known; None if it is."""
         return self._localiser.problem(self._state.observer.A)
 
     @property

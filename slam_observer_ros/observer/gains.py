@@ -2,7 +2,8 @@
 
 Gains that know no joint covariance have no errors, and what a subclass of :class:`Gains` does not
 override is right where no noise is known. Landmarks are given by rows (m,), points (m, 3) in the
-body frame, metres, with covariances (m, 3, 3), m².
+body frame, metres, with covariances (m, 3, 3), m², and how the points change with the calibration,
+D (m, 3, c), reference frame; None where they don't.
 """
 
 from __future__ import annotations
@@ -21,8 +22,12 @@ from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals, SeenPoints
-from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
+from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.sensor_models.calibration import (
+    Calibration,
+    SENSOR_STDDEVS,
+    without_calibration,
+)
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -36,9 +41,7 @@ OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 
 OF_JOINT_COVARIANCES = (
     'motion_noise_factor',
-    'sensor_rotation_stddev',
-    'sensor_translation_stddev',
-    'range_scale_stddev',
+    *SENSOR_STDDEVS,
 )
 """Settings of what only a joint covariance can estimate."""
 
@@ -126,7 +129,7 @@ class Gains(ABC):
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
         self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
-        self.calibration = Calibration(self.estimated(settings), self.axes)
+        self.calibration = Calibration(self.observer, self.estimated(settings), self.axes)
         self.motion_noise = MotionNoise(settings)
 
     @staticmethod
@@ -137,7 +140,8 @@ class Gains(ABC):
     def copy(self) -> Self:
         """Return an independent copy."""
         other = copy(self)
-        other.observer, other.calibration = self.observer.copy(), self.calibration.copy()
+        other.observer = self.observer.copy()
+        other.calibration = self.calibration.of(other.observer)
         other.motion_noise = self.motion_noise.copy()
         return other
 
@@ -156,15 +160,21 @@ class Gains(ABC):
     def prepare(self, rows: IntArray) -> None:  # noqa: B027 (most gains postpone nothing)
         """Bring landmarks (m,) up to date that are going to be observed; −1 for a new one."""
 
-    def residuals(self, rows: IntArray, seen: SeenPoints, dt_s: FloatArray) -> Residuals:
+    def residuals(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        dt_s: FloatArray,
+        D: FloatArray | None = None,
+    ) -> Residuals:
         """Return what landmarks ``rows`` (m,) say against X̂ (29).
 
         ``dt_s`` (m,) is the time since each was last seen.
         """
         observer = self.observer
-        e, r = observer.errors(rows, seen.points)
-        R = observer.turned(seen.covariances)
-        return Residuals(rows, e, r, observer.a[rows], R, dt_s, seen.D)
+        e, r = observer.errors(rows, points)
+        return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s, D)
 
     @abstractmethod
     def observe(self, residuals: Residuals) -> FloatArray:
@@ -172,17 +182,25 @@ class Gains(ABC):
 
     # Landmarks and sensors
 
-    def add(self, seen: SeenPoints) -> None:
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks seen for the first time."""
-        self.observer.add_landmarks(seen.points)
+        self.observer.add_landmarks(points)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks that a map knows, reference frame; their errors may be correlated."""
         self.observer.add_reference_landmarks(known.points)
 
-    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones, seen for the first time."""
-        self.observer.relocate_landmarks(rows, seen.points)
+        self.observer.relocate_landmarks(rows, points)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``; those behind move up."""

@@ -11,16 +11,6 @@ from slam_observer_ros.geometry.axes import EstimatedAxes
 
 
 @dataclass(frozen=True, slots=True)
-class SeenPoints:
-    """Where m landmarks are seen, in the body frame."""
-
-    points: FloatArray  # (m, 3) metres
-    covariances: FloatArray  # (m, 3, 3) of the points, m²
-    # (m, 3, c) how points change with the calibration, reference frame; None where they don't
-    D: FloatArray | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Residuals:
     """What an observation of m known landmarks says against the state, in the reference frame."""
 

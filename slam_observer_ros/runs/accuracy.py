@@ -26,7 +26,12 @@ from slam_observer_ros.evaluation.trajectory import filled, Trajectory
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
-from slam_observer_ros.sensor_models.calibration import DELAY, NAMES, stated_of_velocity
+from slam_observer_ros.sensor_models.calibration import (
+    DELAY,
+    MOVES,
+    OF_VELOCITY,
+    stated_of_velocity,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -119,15 +124,16 @@ def _calibrated(motion: Trajectory, estimator: Estimator) -> Trajectory:
     """Return dead reckoning as it is with the scales, biases and the delay of the velocities."""
     if len(motion) < 2:
         return motion
-    stated = stated_of_velocity(estimator.settings)
+    values = stated_of_velocity(estimator.settings)
     found = {estimate.name: estimate.value for estimate in estimator.calibration}
-    values = np.array([found.get(name, value) for name, value in zip(NAMES, stated, strict=True)])
+    for entry in OF_VELOCITY:
+        values[entry.place] = found.get(entry.name, values[entry.place])
+    rates = values[:DELAY].reshape(6, 7)
     dt_s = to_s(np.diff(motion.stamps_ns))[:, None]
     twists = se3.log(se3.inverse(motion.poses[:-1]) @ motion.poses[1:])
     moves = np.abs(twists).max(axis=1, keepdims=True) > STILL
-    poses = se3.path(
-        motion.poses[0], values[:6] * twists + values[6:DELAY] * np.where(moves, dt_s, 0.0)
-    )
+    biases = rates[:, MOVES] * np.where(moves, dt_s, 0.0)
+    poses = se3.path(motion.poses[0], twists @ rates[:, :MOVES].T + biases)
     return Trajectory(motion.stamps_ns + to_ns(values[DELAY]), poses)
 
 

@@ -127,11 +127,15 @@ def estimator_values(
     return values
 
 
-def of_estimate(estimator: Diagnosed) -> list[Finding]:
-    """Judge the velocity, its calibration and its noise, by the estimate alone."""
+def of_velocity(estimator: Diagnosed) -> list[Finding]:
+    """Judge whether velocities still come."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
+    return [found('stale_velocity')] if stale else []
+
+
+def of_estimate(estimator: Diagnosed) -> list[Finding]:
+    """Judge what is estimated of velocities and sensors, live and after a whole run alike."""
     return [
-        *([found('stale_velocity')] if stale else []),
         *of_calibration(estimator.calibration),
         *of_mounting(estimator.calibration),
         *of_noise(estimator.motion_factors),
@@ -271,6 +275,13 @@ def of_left_out(counts: Counter[str], level: Level) -> list[Finding]:
     return [replace(finding, level=level)]
 
 
+def of_stamps(unstamped: Counter[str]) -> list[Finding]:
+    """Report topics whose messages, so many of each, came without a stamp."""
+    if not unstamped:
+        return []
+    return [found('zero_stamps', topics=', '.join(unstamped), count=unstamped.total())]
+
+
 def of_map(counts: Counter[str], *, is_start_given: bool) -> Iterator[Finding]:
     """Judge whether a map that does not grow is that of the place."""
     share = point_share(counts, 'unmapped_landmark')
@@ -283,7 +294,7 @@ def diagnostics(
     messages: OutgoingMessages, stamp_ns: int, estimator: Diagnosed, hardware_id: str
 ) -> Any:
     """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
-    findings = of_estimate(estimator)
+    findings = of_velocity(estimator) + of_estimate(estimator)
     warnings = [finding.what for finding in findings]
     values = estimator_values(estimator, estimator.dropped, findings)
     status = messages.make(

@@ -62,8 +62,8 @@ def _all_sensed(seen: list[Keyframe]) -> Sensed | None:
     return joined_sensed(sensed) if sensed else None
 
 
-class _Step(NamedTuple):
-    """A keyframe and the motion that led to it, the sum of those given to History.move."""
+class _Link(NamedTuple):
+    """The motion that led to a keyframe: the sum of those given to History.move."""
 
     start: FloatArray
     end: FloatArray
@@ -71,11 +71,10 @@ class _Step(NamedTuple):
     sensitivity: FloatArray
     drift: FloatArray
     calibration: FloatArray
-    keyframe: Keyframe
     slip: Motion | None  # after it, if the robot was taken for slipped
 
     @property
-    def with_slip(self) -> list[_Step]:
+    def with_slip(self) -> list[_Link]:
         """The same with the slip as a part of the motion; none if there was none."""
         slip = self.slip
         if slip is None:
@@ -111,7 +110,8 @@ class History:
         self._none = no_keyframes(axes.p, len(prior.calibration), axes.point, q)
         self._summarised: list[Keyframes] = []
         self._latest = self._none
-        self._new: list[_Step] = []
+        self._new: list[Keyframe] = []
+        self._new_links: list[_Link] = []  # to each of these
 
     def copy(self) -> History:
         """Return an independent history: no array is ever changed in place."""
@@ -159,7 +159,8 @@ class History:
         self.calibrations.append(calibration)
         start = self._end if self._start is None else self._start
         motion = self._motion or self._at_rest()
-        self._new.append(_Step(start, self._end, *motion, self._calibration, keyframe, self._slip))
+        self._new.append(keyframe)
+        self._new_links.append(_Link(start, self._end, *motion, self._calibration, self._slip))
         self._start = self._slip = self._motion = None
 
     def add_calibration(self, values: FloatArray, variances: FloatArray) -> None:
@@ -252,8 +253,9 @@ class History:
         """Return the keyframes that are not summarised."""
         if self._new:
             first = self.summarised + len(self._latest.calibrations)
-            self._latest = joined([self._latest, self._as_arrays(self._new, first)])
-            self._new = []
+            latest = self._as_arrays(self._new, self._new_links, first)
+            self._latest = joined([self._latest, latest])
+            self._new, self._new_links = [], []
         return self._latest
 
     def _change(self, change: Callable[[Keyframes], Keyframes]) -> None:
@@ -261,18 +263,17 @@ class History:
         self._summarised = [change(keyframes) for keyframes in self._summarised]
         self._latest = change(self._gathered())
 
-    def _as_arrays(self, steps: list[_Step], first: int) -> Keyframes:
+    def _as_arrays(self, seen: list[Keyframe], links: list[_Link], first: int) -> Keyframes:
         """Return keyframes as arrays; ``first`` is the number of the first one."""
-        k, seen = self._axes.point, [step.keyframe for step in steps]
-        slips = [number for number, step in enumerate(steps, first) if step.slip is not None]
-        numbers = np.arange(first, first + len(steps))
+        slips = [number for number, link in enumerate(links, first) if link.slip is not None]
+        k, numbers = self._axes.point, np.arange(first, first + len(seen))
         dt_s = np.concatenate([part.dt_s for part in seen])
         return Keyframes(
-            links=self._links(steps),
+            links=self._in_frames_of_ends(links),
             slips=np.array(slips, dtype=np.int64),
-            slipped=self._links([slipped for step in steps for slipped in step.with_slip]),
-            calibrations=np.array([step.calibration for step in steps]),
-            drift_covariances=np.array([step.drift for step in steps]),
+            slipped=self._in_frames_of_ends([each for link in links for each in link.with_slip]),
+            calibrations=np.array([link.calibration for link in links]),
+            drift_covariances=np.array([link.drift for link in links]),
             keyframes=np.repeat(numbers, [len(part.rows) for part in seen]),
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
@@ -282,17 +283,17 @@ class History:
             sensed=_all_sensed(seen),
         )
 
-    def _links(self, steps: list[_Step]) -> Links:
-        """Return motions in the frame of the pose that they led to."""
-        if not steps:
+    def _in_frames_of_ends(self, links: list[_Link]) -> Links:
+        """Return motions as arrays, each in the frame of the pose that it led to."""
+        if not links:
             return self._none.links
-        pose, back = self._axes.pose, se3.inverse(np.array([step.end for step in steps]))
-        starts, noises = [step.start for step in steps], [step.noise for step in steps]
+        pose, back = self._axes.pose, se3.inverse(np.array([link.end for link in links]))
+        starts, noises = [link.start for link in links], [link.noise for link in links]
         to_body = se3.adjoint(back)[:, pose, pose]
         return Links(
             motions=se3.inverse(back @ np.array(starts)),
             covariances=to_body @ np.array(noises) @ transpose(to_body),
-            sensitivities=to_body @ np.array([step.sensitivity for step in steps]),
+            sensitivities=to_body @ np.array([link.sensitivity for link in links]),
         )
 
     def _turns(self, seen: list[Keyframe]) -> SeenTurns | None:

@@ -12,34 +12,35 @@ from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahal
 from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.step import LOG_ROOT_2_PI
-from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """Residuals r (m, k), metres, as they are before a correction, and their covariance."""
+    """Residuals of m points before a correction, metres, and what was expected of them."""
 
-    r: FloatArray
+    r: FloatArray  # (m, k)
     distances: FloatArray  # (m,) Mahalanobis distance of each
-    S: FloatArray | None  # (m k, m k) joint covariance, m²; None if unknown
-    shares: FloatArray  # (m,) of an observation with new errors, that each is worth
+    R: FloatArray  # (m, k, k) what of their covariance is that of the points, m²
+    S: FloatArray  # (m k, m k) their joint covariance, m²; empty if it is not known
 
     @classmethod
-    def of(cls, gains: Gains, residuals: Residuals, error_time_s: float) -> Expected:
-        """Ask gains, before they correct the state; errors last for ``error_time_s``."""
-        r, _ = residuals.on(gains.axes)
-        repeated = repetition_factors(residuals.dt_s, error_time_s)
+    def of(cls, gains: Gains, residuals: Residuals) -> Expected:
+        """Ask gains, before they correct the state."""
+        r, R = residuals.on(gains.axes)
         if gains.errors is not None and len(r):
             S = gains.errors.innovation_covariance(residuals)
-            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), S, 1.0 / repeated)
+            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), R, S)
         distances = gains.distances(residuals) if len(r) else np.empty(0)
-        return cls(r, distances, None, 1.0 / repeated)
+        return cls(r, distances, R, np.empty((0, 0)))
 
-    def judge(self, weights: FloatArray) -> NormalisedInnovation:
-        """Return how far off the residuals are, given the weights (m,) of the correction."""
+    def judge(self, weights: FloatArray, shares: FloatArray) -> NormalisedInnovation:
+        """Return how far off the residuals are, given the weights (m,) of the correction.
+
+        ``shares`` (m,) is what each is worth of an observation with new errors.
+        """
         (m, k), used = self.r.shape, weights > 0.0
         nis, log_densities = None, np.full(m, -np.inf)
-        if self.S is not None and used.any():
+        if len(self.S) and used.any():
             rows = np.flatnonzero(np.repeat(used, k))
             L = cholesky(self.S[np.ix_(rows, rows)])
             # One after the other, each as those before it have it: the product is that of all.
@@ -53,5 +54,5 @@ class Expected:
             nis,
             0 if nis is None else k * int(np.count_nonzero(used)),
             log_densities,
-            self.shares,
+            shares,
         )

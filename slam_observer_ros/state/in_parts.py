@@ -137,5 +137,5 @@ def _outcome(
             shares,
         )
     return Outcome(
-        ids, of_all.out.r, rejected, NO_IDS, innovation, usual.weighed(state, of_used.out)
+        ids, of_all.out.r, rejected, NO_IDS, innovation, usual.expected(state, of_used.out)
     )

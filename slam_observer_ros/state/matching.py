@@ -10,7 +10,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals, SeenPoints
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
@@ -92,7 +92,7 @@ def enter(state: State, event: ObservationEvent, noise: FloatArray) -> None:
     state.counts['unmapped_landmark'] += new - m
     if m:
         event = corrected_again(state, event.select(np.arange(new) < m))
-        state.gains.add(SeenPoints(event.points, noise[:m], sensitivity(state, event)))
+        state.gains.add(event.points, noise[:m], sensitivity(state, event))
         state.landmarks.add(event.ids, event.stamp_ns)
 
 
@@ -105,7 +105,7 @@ def residuals_of(
     if event.sensed is not None:
         state.gains.prepare(rows)
         D = sensitivity(state, event, state.observer.body_points(rows))
-    return state.gains.residuals(rows, SeenPoints(event.points, covariances, D), dt_s)
+    return state.gains.residuals(rows, event.points, covariances, dt_s, D)
 
 
 def keyframe_of(

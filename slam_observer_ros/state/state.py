@@ -15,7 +15,6 @@ from slam_observer_ros.geometry.matrices import correlations_of
 from slam_observer_ros.observer.gains import Errors, Gains
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
@@ -198,9 +197,11 @@ class State:
         if self.relinearisation is not None:
             self.relinearisation.add_calibration()
 
-    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
-        """Take landmarks (m,) for new ones."""
-        self.gains.relocate(rows, seen)
+    def relocate(
+        self, rows: IntArray, points: FloatArray, covariances: FloatArray, D: FloatArray | None
+    ) -> None:
+        """Take landmarks (m,) for new ones: :meth:`.Gains.relocate`."""
+        self.gains.relocate(rows, points, covariances, D)
         if self.relinearisation is not None:
             self.relinearisation.relocate(rows)
 
@@ -247,10 +248,10 @@ class State:
             )
         # From the reference frame to the world.
         (step, slips), rows = self.relinearisation.smooth(), self.confirmed
-        found, calibration = step.end, self.calibration.copy()
+        found, calibration = step.end, self.calibration
         entries = slice(self.axes.p, self.axes.p + calibration.count)
         covariance = step.marginal()[entries, entries]
-        calibration.shift(found.calibrations[-1] - calibration.values)
+        values = calibration.shifted(found.calibrations[-1] - calibration.values)
         history, P = self.relinearisation.history, self.observer.reference_pose
         turned = found.orientations
         return Smoothed(
@@ -261,6 +262,6 @@ class State:
             since=history.since,
             slips=slips,
             orientations=None if turned is None else P[:3, :3] @ turned[rows],
-            calibration=calibration.estimates(np.diagonal(covariance)),
+            calibration=calibration.estimates(np.diagonal(covariance), values),
             calibration_correlations=correlations_of(covariance),
         )

@@ -6,8 +6,9 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observer.residuals import Residuals, SeenPoints
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import accepted
+from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
     corrected_again,
@@ -34,9 +35,7 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     matched = correct_by_orientations(state, matched)  # φ_i = log(R_Â Z_i B̂_iᵀ)
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     _drop_history_if_full(state, matched)
-    expected = None
-    if state.judges_innovations:
-        expected = Expected.of(state.gains, residuals, state.observation_noise.error_time_s)
+    expected = Expected.of(state.gains, residuals) if state.judges_innovations else None
     weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
     rejected = weights == 0.0
     _count(state, matched, rejected)
@@ -44,7 +43,10 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     take_over_orientations(state, event, rows)  # B̂_i = R_Â Z_i
     moved_ids = _relinearise(state, event, rows)
     _set_velocities(state, event, rows)  # (19)
-    innovation = None if expected is None else expected.judge(weights)
+    innovation = None
+    if expected is not None:
+        repeated = repetition_factors(residuals.dt_s, state.observation_noise.error_time_s)
+        innovation = expected.judge(weights, 1.0 / repeated)
     return Outcome(matched.known.ids, residuals.r, rejected, moved_ids, innovation)
 
 
@@ -116,8 +118,7 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
         moved_to = event.select(far)
-        seen = SeenPoints(moved_to.points, noise[far], sensitivity(state, moved_to))
-        state.relocate(rows[far], seen)
+        state.relocate(rows[far], moved_to.points, noise[far], sensitivity(state, moved_to))
         state.landmarks.take_for_new(rows[far], event.stamp_ns)
         take_over_orientations(state, moved_to, rows[far])
     return event.ids[moved]

@@ -16,6 +16,7 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis
 from slam_observer_ros.geometry.sensor_mounting import Sensed
 from slam_observer_ros.observer import core, step
 from slam_observer_ros.observer.flat_arrays import (
@@ -34,20 +35,13 @@ from slam_observer_ros.sensor_models.motion_noise import Factors
 from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.covariances import of_pose
+from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.state import State
 
 MOST_WORK = 1e7
 """Multiplications of a correction of P beyond which BLAS, in the general way, takes less time."""
 
 _NO_ENTRIES, NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
-
-
-class Weighed(NamedTuple):
-    """Residuals of q points, and what was expected of them: metres, reference frame."""
-
-    r: FloatArray  # (q, k)
-    S: FloatArray  # (q k, q k) their covariance
-    R: FloatArray  # (q, k, k) what of it is that of the points
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +53,7 @@ class Outcome:
     rejected: BoolArray  # (m,) which of them were too far off to be used
     moved_ids: IntArray  # ids of landmarks that it showed to have moved
     innovation: NormalisedInnovation | None = None
-    weighed: Weighed | None = None  # of those that were used, if it was asked for
+    expected: Expected | None = None  # of those that were used, if it was asked for
 
 
 def advance(
@@ -162,7 +156,7 @@ def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Outcom
         np.zeros(len(event.ids), dtype=np.bool_),
         NO_IDS,
         innovation(state, out),
-        weighed(state, out),
+        expected(state, out),
     )
 
 
@@ -286,8 +280,8 @@ def _estimate_of(
         size,
         first,
         state.settings.two_d_mode,
-        calibration._all,
-        calibration._estimated,
+        calibration.rates,
+        calibration.velocity_places,
         calibration.drift_covariance,
     )
 
@@ -330,9 +324,9 @@ def _seen(state: State, event: ObservationEvent, places: IntArray) -> Seen:
     calibration = state.calibration
     values, estimated, column = None, NO_IDS, 0
     if calibration.corrects_points:
-        sensor = calibration.sensors[event.sensor_frame]
-        values, estimated = sensor.values, sensor.estimated
-        column = calibration.columns(sensor).start
+        frame = event.sensor_frame
+        values, estimated = calibration.sensor(frame), calibration.of_sensor
+        column = calibration.columns(frame).start
     if state.settings.range_is_depth:
         cosines = sensing.cosines(arms, event.sensor_axis)
         arms = arms / cosines[:, None]
@@ -359,7 +353,7 @@ def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Key
     """Return what is needed to linearise again what was seen."""
     seen, out, sensed = corrected.seen, corrected.out, None
     if seen.sensor is not None:
-        number = state.calibration.sensors[event.sensor_frame].number
+        number = state.calibration.sensors.index(event.sensor_frame)
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
     stated = out.covariances if len(out.covariances) else None
@@ -387,10 +381,11 @@ def innovation(state: State, out: Observed) -> NormalisedInnovation | None:
     )
 
 
-def weighed(state: State, out: Observed) -> Weighed | None:
+def expected(state: State, out: Observed) -> Expected | None:
     """Return what was expected of the residuals, if that was asked for."""
     if not len(out.expected):
         return None
     m, k = len(out.r), state.axes.point
-    S, R = out.expected[: (m * k) ** 2], out.expected[(m * k) ** 2 :]
-    return Weighed(out.r[:, :k], S.reshape(m * k, m * k), R.reshape(m, k, k))
+    r, S, R = out.r[:, :k], out.expected[: (m * k) ** 2], out.expected[(m * k) ** 2 :]
+    S = S.reshape(m * k, m * k)
+    return Expected(r, mahalanobis(r, diagonal_blocks(S, k)), R.reshape(m, k, k), S)

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-import itertools
 from pathlib import Path
 from unittest.mock import Mock
 
 import gain_worlds
-from hypothesis import given
-from hypothesis import strategies as st
+from nameless_points import observe, PLANAR, SPATIAL, stand
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
-from slam_observer_ros.association.hypothesis import FieldOfView, LandmarkIndex, Visibility
-from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
-    columns_of,
     huber_loss,
-    joint_cost,
     JointSearch,
-    MAX_PARTIAL,
     Pairs,
     PRUNING_COST,
 )
@@ -41,19 +33,14 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.designs import make_gains
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.recording.data_sets import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
-from slam_observer_ros.state.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM
-from slam_observer_ros.state.matching import match
 from slam_observer_ros.state.state import State
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'wheeled_bearing_range.yaml'
-PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
-SPATIAL = Settings(reorder_window=0.0)
 
 
 def nameless(event):
@@ -82,17 +69,6 @@ def test_the_same_events_give_the_same_bits():
     assert_array_equal(first.pose, second.pose)
     assert_array_equal(first.landmark_ids, second.landmark_ids)
     assert_array_equal(first.world_points, second.world_points)
-
-
-def observe(estimator, time_s, points, ids=None):
-    """Add an observation of body points with ids, by default none."""
-    ids = np.full(len(points), UNKNOWN_ID) if ids is None else np.array(ids)
-    event = ObservationEvent(round(time_s * 1e9), ids, np.array(points, dtype=float))
-    assert estimator.add(event)
-
-
-def stand(estimator, time_s, body_velocity=(0, 0, 0, 0, 0, 0)):
-    assert estimator.add(VelocityEvent(round(time_s * 1e9), np.array(body_velocity, dtype=float)))
 
 
 def test_what_is_seen_once_or_twice_is_never_in_the_map_and_soon_forgotten():
@@ -162,41 +138,6 @@ def test_what_was_seen_once_is_known_again_after_looking_elsewhere():
     assert estimator.counts['unsupported_landmark'] == 0
     assert estimator.landmark_ids.tolist() == [FIRST_AUTOMATIC_ID + i for i in range(6)]
     assert estimator.landmark_counts.tolist() == [5, 5, 5, 6, 300, 300]
-
-
-@given(st.integers(0, 10_000), st.integers(1, 40), st.sampled_from([2, 3]))
-def test_a_sensor_sees_where_it_saw_something_and_in_between(seed, m, k):
-    rng = np.random.default_rng(seed)
-    seen = rng.normal(size=(m, 3)) * [1.0, 1.0, k == 3]
-    field = FieldOfView(k)
-    for point in seen:
-        field.include(point[None])
-    last = FieldOfView(k)
-    last.include(seen)
-    shares = rng.dirichlet(np.ones(m + 1), 20)[:, :m]
-    assert field.contains(seen).all()
-    assert field.contains(shares @ seen).all()
-    beyond = 2.0 * seen[[np.argmax(np.linalg.norm(seen, axis=1))]]
-    if m < k:
-        assert field.contains(beyond).all()
-    elif m >= 10:  # with fewer all may lie nearly in one line
-        assert not field.contains(beyond).any()
-    assert not (field.contains(3.0 * seen) & ~last.contains(3.0 * seen)).any()
-
-
-def test_a_sensor_that_measures_exactly_has_a_field_of_view_with_few_corners():
-    field, rng = FieldOfView(3), np.random.default_rng(0)
-    for _ in range(3000):
-        direction = rng.normal(size=3)
-        field.include(3.0 * direction[None] / np.linalg.norm(direction))
-    assert len(field.corners) < 300
-
-
-def test_where_all_points_lie_in_one_plane_all_of_space_counts_as_in_view():
-    field = FieldOfView(3)
-    for step in range(100):
-        field.include(np.array([[np.cos(step), np.sin(step), 0.0]]))
-    assert field.contains(np.array([[0.0, 0.0, 5.0], [9.0, 0.0, 0.0]])).all()
 
 
 def test_points_with_and_without_id_are_distinguished_in_one_observation():
@@ -392,85 +333,6 @@ def _configuration_rmse_m(run, change=None):
     return error.rmse_m
 
 
-@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 3), st.sampled_from([2, 3]))
-def test_where_few_pairings_are_possible_the_search_finds_the_cheapest(seed, points, landmarks, k):
-    rng = np.random.default_rng(seed)
-    at, rows = np.nonzero(rng.random((points, landmarks)) < 0.8)
-    q, gate = len(at), 3.0
-    root = rng.normal(size=(q * k, q * k))
-    noise = np.tile(0.3 * np.eye(k), (q, 1, 1))
-    S = 0.2 * root @ root.T + np.kron(np.eye(q), 0.3 * np.eye(k))
-    r = rng.normal(scale=1.5, size=(q, k))
-    options = np.bincount(at, minlength=points)
-
-    def cost(chosen):
-        in_order = sorted(chosen, key=lambda i: (options[at[i]], at[i]))
-        columns = columns_of(in_order, k)
-        root = np.linalg.cholesky(S[np.ix_(columns, columns)])
-        whitened = np.linalg.solve(root, r[in_order].ravel()).reshape(-1, k)
-        log_ratio = 2 * np.sum(np.log(np.diag(root))) - len(chosen) * k * np.log(0.3)
-        unpaired = len(np.unique(at)) - len(chosen)
-        return (
-            np.sum(huber_loss(np.linalg.norm(whitened, axis=1)))
-            + log_ratio
-            + unpaired * huber_loss(gate)
-        )
-
-    possible = [
-        chosen
-        for count in range(q + 1)
-        for chosen in itertools.combinations(range(q), count)
-        if len({at[i] for i in chosen}) == len({rows[i] for i in chosen}) == count
-    ]
-    pairs = Pairs(at, rows, r, S, noise)
-    certain, unpaired_costs = np.zeros(q, dtype=bool), np.full(q, huber_loss(gate))
-    found = JointSearch(pairs, certain, unpaired_costs, np.inf).pairings()
-    least = min(cost(chosen) for chosen in possible)
-    assert found[0].cost == pytest.approx(least)
-    assert found[0].cost == pytest.approx(cost(found[0].chosen))
-    assert len(found) == min(len(possible), MAX_PARTIAL)
-    costs = [
-        pairing.cost for pairing in JointSearch(pairs, certain, unpaired_costs, 10.0).pairings()
-    ]
-    assert costs == sorted(costs)
-    assert costs[-1] <= costs[0] + 10.0
-
-
-@given(st.integers(0, 10_000), st.integers(1, 4), st.sampled_from([2, 3]))
-def test_where_each_point_may_be_of_one_landmark_all_pairs_are_what_the_search_finds(seed, q, k):
-    rng = np.random.default_rng(seed)
-    noise, root = np.tile(0.3 * np.eye(k), (q, 1, 1)), rng.normal(size=(q * k, q * k))
-    S = 0.2 * root @ root.T + np.kron(np.eye(q), 0.3 * np.eye(k))
-    pairs = Pairs(np.arange(q), np.arange(q), rng.normal(size=(q, k)), S, noise)
-    search = JointSearch(pairs, np.zeros(q, dtype=bool), np.full(q, huber_loss(2.5)), np.inf)
-    together, found = search.all_pairs(), search.pairings()
-    (same,) = [pairing for pairing in found if len(pairing.chosen) == q]
-    if together is None:  # one of them is better left out
-        z, log_diagonal = same.z.reshape(q, k), np.log(np.diag(same.L)).reshape(q, k)
-        rises = huber_loss(np.linalg.norm(z, axis=1)) - 2.0 * log_diagonal.sum(axis=1)
-        assert max(rises - k * np.log(0.3)) > huber_loss(2.5)
-        return
-    assert together.cost == pytest.approx(same.cost)
-    assert_allclose(together.z, same.z)
-    assert_allclose(together.L, same.L)
-
-
-@given(st.integers(0, 10_000), st.integers(0, 5), st.sampled_from([2, 3]))
-def test_what_ids_cost_does_not_depend_on_the_order_of_points(seed, m, k):
-    rng = np.random.default_rng(seed)
-    root, noise = rng.normal(size=(m * k, m * k)), np.tile(0.3 * np.eye(k), (m, 1, 1))
-    S = root @ root.T + np.kron(np.eye(m), 0.3 * np.eye(k))
-    r = rng.normal(scale=5.0, size=(m, k))
-    order = rng.permutation(m)
-    columns = columns_of(order.tolist(), k)
-    turned = joint_cost(r[order], S[np.ix_(columns, columns)], noise)
-    assert joint_cost(r, S, noise) == pytest.approx(turned)
-    near = 0.1 * r / (1.0 + np.linalg.norm(np.linalg.solve(S, r.ravel())))
-    plain = near.ravel() @ np.linalg.solve(S, near.ravel())
-    log_ratio = np.linalg.slogdet(S)[1] - m * k * np.log(0.3)
-    assert joint_cost(near, S, noise) == pytest.approx(plain + log_ratio)
-
-
 def test_a_point_with_a_new_id_takes_no_landmark_from_a_point_without():
     estimator = Estimator(replace(SPATIAL, confirmations=1))
     for step in range(20):
@@ -500,25 +362,6 @@ def test_a_landmark_first_seen_without_its_id_takes_it_when_it_is_given(settings
     expected = named.world_points[np.argsort(named.landmark_ids)]
     assert_allclose(estimator.world_points[order], expected, atol=1e-6)
     assert_allclose(estimator.pose, named.pose, atol=1e-6)
-
-
-def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
-    """Else states with other maps could not be compared."""
-    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
-    costs = []
-    for some_have_no_id in (False, True):
-        estimator = Estimator(SPATIAL)
-        for step in range(10):
-            stand(estimator, 0.1 * step)
-            far = [[30.0, 30.0, 0.0]] if some_have_no_id else []
-            observe(estimator, 0.1 * step, [*points, *far], [1, 2, *[UNKNOWN_ID] * len(far)])
-        new = np.array([*points, [-2.0, 2.0, 0.0]])
-        event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
-        state, index = estimator._hypotheses.best, LandmarkIndex()
-        matched = match(state, event)
-        (only,) = interpretations(state, index, event, matched, np.arange(3), 20.0, np.inf)
-        costs.append(only.cost)
-    assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
 
 def test_ids_name_the_landmarks_of_a_fixed_map_that_has_none():
@@ -572,144 +415,6 @@ def test_many_points_seen_after_a_blind_stretch_are_distinguished_together(seed)
     assert_array_equal(at[found[0].chosen], rows[found[0].chosen])
 
 
-@given(st.integers(0, 10_000), st.integers(1, 300), st.floats(0.01, 20.0))
-def test_the_index_misses_no_landmark_while_they_move_and_change_in_number(seed, first, radius_m):
-    rng = np.random.default_rng(seed)
-    index, landmarks = LandmarkIndex(), rng.uniform(-10.0, 10.0, (first, 3))
-    for _ in range(4):
-        points = rng.uniform(-10.0, 10.0, (3, 3))
-        radii_m = radius_m * rng.uniform(0.5, 1.0, 3)
-        found = np.zeros((3, len(landmarks)), dtype=bool)
-        found[index.near(landmarks, points, radii_m)] = True
-        distances_m = np.linalg.norm(points[:, None] - landmarks, axis=2)
-        assert found[distances_m <= radii_m[:, None]].all()
-        landmarks = landmarks + rng.normal(scale=0.05, size=landmarks.shape)
-        landmarks = np.concatenate([landmarks, rng.uniform(-10.0, 10.0, (rng.integers(9), 3))])
-        landmarks = np.delete(landmarks, rng.integers(len(landmarks)), axis=0)
-
-
-def looked_at(counts, looks, settled_looks=0, settled_seen=0):
-    """A table of landmarks without ids, after one that has settled was in view and seen so often.
-
-    The landmark of row 0 is that one, the next are those of ``counts`` and ``looks``.
-    """
-    landmarks = LandmarkTable()
-    landmarks.add_known(np.array([FIRST_AUTOMATIC_ID]), np.array([100]))
-    landmarks.add(FIRST_AUTOMATIC_ID + 1 + np.arange(len(counts)), 0)
-    landmarks.counts[1:] = counts
-    for look in range(settled_looks):
-        landmarks.note_in_view(np.array([0]), np.array([look < settled_seen]))
-    for row, times in enumerate(looks, start=1):
-        for _ in range(times):
-            landmarks.note_in_view(np.array([row]), np.array([False]), has_moved=False)
-    return landmarks
-
-
-def test_a_landmark_seen_far_more_seldom_than_others_in_view_is_unsupported():
-    landmarks = looked_at([1, 4, 4, 5], [50, 50, 20, 50], settled_looks=996, settled_seen=499)
-    assert landmarks.unsupported(5).tolist() == [1, 2]
-    assert landmarks.unsupported(1).tolist() == []
-
-
-def test_where_all_are_seen_seldom_it_takes_longer():
-    landmarks = looked_at([1, 1], [199, 201], settled_looks=1000, settled_seen=100)
-    assert landmarks.unsupported(5).tolist() == [2]
-
-
-def test_what_has_settled_stays_however_long_it_is_hidden_from_one_place():
-    landmarks = looked_at([5], [0], settled_looks=100, settled_seen=100)
-    assert landmarks.unsupported(5).tolist() == []
-    for _ in range(1000):
-        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]), has_moved=False)
-    assert landmarks.unsupported(5).tolist() == []
-
-
-@pytest.mark.parametrize('counts', [5, 20])
-def test_what_has_settled_goes_if_it_is_seen_five_times_too_seldom_from_many_places(counts):
-    landmarks = looked_at([counts], [0], settled_looks=100, settled_seen=100)
-    landmarks.unsupported(5)
-    for _ in range(TOO_SELDOM * counts - 1):
-        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
-        landmarks._confirmed_in_view = landmarks._confirmed_seen  # others are seen each time
-    assert landmarks.unsupported(5).tolist() == []
-    landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
-    landmarks._confirmed_in_view = landmarks._confirmed_seen
-    assert landmarks.unsupported(5).tolist() == [1]
-
-
-def test_on_new_ground_a_new_landmark_costs_less_and_where_all_is_known_as_much_as_the_gate():
-    new, gate_cost = NewLandmarks(), huber_loss(6.0)
-    event = ObservationEvent(0, np.full(5, UNKNOWN_ID), np.zeros((5, 3)))
-    for second in range(100):
-        new.note(replace(event, stamp_ns=second * 10**9), confirmed=1)
-    assert new.cost(gate_cost) == pytest.approx(gate_cost - 2.0 * np.log(0.2 / 0.0017), abs=0.1)
-    for second in range(100, 600):
-        new.note(replace(event, stamp_ns=second * 10**9), confirmed=0)
-    assert new.cost(gate_cost) == pytest.approx(gate_cost, abs=0.6)
-    assert new.cost(4.0) == 4.0, 'no more than a point at the gate'
-
-
-def test_nothing_is_forgotten_before_it_is_known_how_often_a_landmark_is_seen():
-    landmarks = looked_at([1, 4], [1000, 1000])
-    assert landmarks.unsupported(5).tolist() == []
-
-
-def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_before():
-    """One has settled, and was seen each time; the other one never was but once."""
-    landmarks, both = LandmarkTable(), np.array([0, 1])
-    landmarks.add(FIRST_AUTOMATIC_ID + both, 0)
-    landmarks.note_in_view(both, np.array([True, True]))
-    for look in range(1, 3 * PATIENCE):
-        assert landmarks.unsupported(3).tolist() == []
-        landmarks.accept(both[:1], look)
-        landmarks.note_in_view(both, np.array([True, False]))
-    assert landmarks.counts.tolist() == [3 * PATIENCE, 1]
-    assert landmarks.unsupported(3).tolist() == [1]
-
-
-def state_of(landmarks, points):
-    """A state with these landmarks (n, 3), of which the table says what was seen of them."""
-    state = State(make_gains(PLANAR, np.eye(4)), PLANAR)
-    state.gains.add_known(KnownLandmarks(points, np.tile(np.eye(3), (len(points), 1, 1))))
-    state.landmarks = landmarks
-    return state
-
-
-def test_before_it_is_known_where_a_sensor_looks_no_place_is_unexpected():
-    landmarks, visibility = LandmarkTable(), Visibility(2)
-    landmarks.add_known(FIRST_AUTOMATIC_ID + np.arange(3), np.full(3, 100))
-    state = state_of(landmarks, 5.0 * np.eye(3))
-    for look in range(200):
-        straight_ahead = ObservationEvent(
-            look, np.array([UNKNOWN_ID]), np.array([[1.0, 0.0, 0.0]])
-        )
-        assert visibility.note(state, straight_ahead, some_have_ids=False) == 0.0
-    assert state.counts['unexpected_place'] == 0
-
-
-@pytest.mark.parametrize('misses', [1, 5, 40])
-def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_soon_no_more(misses):
-    """After k looks that miss it 2 ln(1 + k p): for the first one much, by and by little."""
-    landmarks, share, visibility = looked_at([], [], 10, 5), 0.5, Visibility(2)
-    state = state_of(landmarks, np.array([[2.0, 0.0, 0.0]]))
-    ahead = 4.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]])
-    others = ObservationEvent(10, np.full(2, UNKNOWN_ID), ahead)
-    landmarks.note_in_view = lambda rows, seen, has_moved: None  # so that the share stays
-    costs = [visibility.note(state, others, some_have_ids=False)]
-    for landmarks.missed[0] in range(misses):
-        costs.append(visibility.note(state, others, some_have_ids=False))
-    assert costs[0] == 0.0, 'before anything was seen it is not known where the sensor looks'
-    assert_allclose(sum(costs), 2.0 * np.log1p(misses * share))
-    landmarks.last_seen_ns[0] = others.stamp_ns
-    assert visibility.note(state, others, some_have_ids=False) == 0.0
-
-
-def test_a_landmark_that_was_given_its_id_needs_no_support_any_more():
-    landmarks = looked_at([1, 1], [40, 40], settled_looks=10, settled_seen=10)
-    landmarks.renumber(np.array([1]), np.array([7]))
-    assert landmarks.unsupported(5).tolist() == [2]
-
-
 def test_reflectors_that_come_one_a_message_are_all_kept():
     random = np.random.default_rng(0)
     points = random.uniform([-8.0, -8.0, 0.0], [8.0, 8.0, 0.0], (24, 3))
@@ -737,13 +442,6 @@ def test_a_landmark_added_where_a_known_one_should_be_seen_is_said(shift_m, load
     is_said = shift_m > 0.0
     assert estimator.counts['doubled_landmark'] == is_said
     assert ('added where a known one should be seen' in caplog.text) == is_said
-
-
-def test_a_landmark_that_was_placed_again_has_its_chance_again():
-    landmarks = looked_at([4], [39], settled_looks=996, settled_seen=499)
-    landmarks.take_for_new(np.array([1]), 0)
-    landmarks.note_in_view(np.array([1]), np.array([False]))
-    assert landmarks.unsupported(5).tolist() == []
 
 
 def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():

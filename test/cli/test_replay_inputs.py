@@ -263,7 +263,7 @@ class TestVelocities:
                 if stamp_ns == ros.STAMP_NS:
                     drive.landmarks(stamp_ns)
         errors = slam_observer('replay', path).errors
-        assert errors.count('try --velocity-source pose_differences') == moves
+        assert errors.count('set velocity_source: pose_differences') == moves
         again = slam_observer('replay', path, '--velocity-source', 'pose_differences')
         assert again.errors == ''
 

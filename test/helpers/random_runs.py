@@ -7,7 +7,7 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.gains import Gains
-from slam_observer_ros.observer.residuals import Residuals, SeenPoints
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -42,7 +42,7 @@ def residuals_of(
 ) -> Residuals:
     """Residuals of landmarks (m,) that are seen at ``points`` (m, 3), body frame."""
     filter_.prepare(rows)
-    return filter_.residuals(rows, SeenPoints(points, covariances), np.full(len(rows), DT_S))
+    return filter_.residuals(rows, points, covariances, np.full(len(rows), DT_S))
 
 
 def observe(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 import math
 from pathlib import Path
 
@@ -58,6 +58,26 @@ def write_mcap(path: Path) -> Path:
         for item in (*events(), *true_poses()):
             writer.write_event(item)
     return path
+
+
+def write_events(path: Path, written: Iterable[Event | PoseTruth]) -> Path:
+    """Write a recording of what is given."""
+    with RecordingWriter(path) as writer:
+        for item in written:
+            writer.write_event(item)
+    return path
+
+
+def blinded(of: list[Event], which: slice) -> list[Event]:
+    """Take all points out of some of the events."""
+    nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    blind = range(len(of))[which]
+    return [
+        ObservationEvent(event.stamp_ns, *nothing)
+        if isinstance(event, ObservationEvent) and index in blind
+        else event
+        for index, event in enumerate(of)
+    ]
 
 
 def write_beginning(path: Path, of: Path, seconds: float) -> Path:

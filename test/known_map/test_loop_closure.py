@@ -15,7 +15,6 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.state import State
 
@@ -52,7 +51,7 @@ def after_a_loop(points, seen, seed=0):
     state.set_pose(pose, covariance)
     noise = SIGMA_M * np.pad(rng.normal(size=(len(seen), 2)), ((0, 0), (0, 1)))
     body = se3.transform(se3.inverse(true_pose), points[seen]) + noise
-    state.gains.add(SeenPoints(body, np.tile(SIGMA_M**2 * np.eye(3), (len(seen), 1, 1))))
+    state.gains.add(body, np.tile(SIGMA_M**2 * np.eye(3), (len(seen), 1, 1)))
     state.landmarks.add(FIRST_AUTOMATIC_ID + len(points) + np.arange(len(seen)), LOOP_NS)
     state.landmarks.counts[:] = 9
     state.landmarks.tentative[:] = False

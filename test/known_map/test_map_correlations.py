@@ -28,7 +28,6 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD
@@ -224,9 +223,7 @@ def mapped(rng, settings, n=8, design=RiccatiGains):
     """A filter that has seen n landmarks, and moved."""
     flat = np.array([1.0, 1.0, not settings.two_d_mode])
     filter_ = design(settings, np.eye(4))
-    filter_.add(
-        SeenPoints(rng.uniform(-5.0, 5.0, (n, 3)) * flat, 0.01 * random_covariances(rng, n, 3))
-    )
+    filter_.add(rng.uniform(-5.0, 5.0, (n, 3)) * flat, 0.01 * random_covariances(rng, n, 3))
     for _ in range(4):
         random_step(filter_, rng, 1e-3, 1e-2)
     return filter_

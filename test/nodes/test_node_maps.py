@@ -21,6 +21,7 @@ from scipy.stats import chi2
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
@@ -540,7 +541,7 @@ def test_with_wrong_parameters_the_node_says_why_and_does_not_start(
 def test_points_without_ids_that_fit_nowhere_in_a_map_are_reported(ros, robot, tmp_path):
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
     surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(5))
-    message = 'fits no place in the map yet: drive on, or give the pose on initialpose'
+    message = found('no_place', where='the map').what
 
     def is_reported():
         return diagnostics and message in diagnostics[-1].status[0].message

@@ -23,7 +23,6 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize, CHECK_INTERVAL
 from slam_observer_ros.observer.riccati.following_landmarks import REFERENCE_SHIFT_M
@@ -122,7 +121,7 @@ class World:
                     filter_.correct_by_orientations(turns)
                 observe(filter_, rows, y, R[: len(known)])
             if len(new):
-                filter_.add(SeenPoints(y_new, R[: len(new)]))
+                filter_.add(y_new, R[: len(new)])
                 if self.are_tags:
                     filter_.add_orientations(turns_new)
         self.ids += new.tolist()
@@ -144,7 +143,7 @@ class World:
     def relocate(self, filters, rows):
         y = self.seen(np.array(self.ids)[rows])
         for filter_ in filters:
-            filter_.relocate(rows, SeenPoints(y, 0.01 * np.eye(3)[None]))
+            filter_.relocate(rows, y, 0.01 * np.eye(3)[None])
 
     def drive(self, filters, steps):
         for _ in range(steps):

@@ -20,7 +20,6 @@ from slam_observer_ros.observer.constant import (
 from slam_observer_ros.observer.continuous_time import innovation, lyapunov, lyapunov_rate
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PAPER_LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 0], [0, 4, 0], [0, -4, 0]])
@@ -44,7 +43,7 @@ def biased_filter(reference_pose=None, bias_m=0.5):
     biased = ConstantGains(Settings(), np.eye(4) if reference_pose is None else reference_pose)
     directions = np.random.default_rng(3).normal(size=(4, 3))
     biases = bias_m * directions / np.linalg.norm(directions, axis=1)[:, None]
-    biased.add(SeenPoints(paper_observation(0.0) + biases, NO_NOISE))
+    biased.add(paper_observation(0.0) + biases, NO_NOISE)
     return biased
 
 
@@ -52,7 +51,7 @@ def observe(filter_, rows, points, dt_s):
     """Correct a filter by landmarks that were seen ``dt_s`` before."""
     m = len(rows)
     dt_s = np.broadcast_to(dt_s, m)
-    filter_.observe(filter_.residuals(rows, SeenPoints(points, np.zeros((m, 3, 3))), dt_s))
+    filter_.observe(filter_.residuals(rows, points, np.zeros((m, 3, 3)), dt_s))
 
 
 def integrate_paper_ode(sign_of_landmarks, sign_of_pose, duration_s, dt_s=1e-3):

@@ -19,14 +19,14 @@ from random_runs import (
     random_step,
     residuals_of,
 )
+import slam_group
 from strategies import generators, poses
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, slam_group, so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati import riccati as riccati_module
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -38,9 +38,7 @@ CALIBRATED = replace(PLAIN, angular_bias_stddev=(0.02,) * 3, linear_scale_stddev
 def started(rng, settings=PLAIN, n=4):
     """A filter that has seen n landmarks, then moved and seen some of them again."""
     riccati = RiccatiGains(settings, np.eye(4))
-    riccati.add(
-        SeenPoints(rng.normal(scale=4.0, size=(n, 3)), 0.01 * random_covariances(rng, n, 3))
-    )
+    riccati.add(rng.normal(scale=4.0, size=(n, 3)), 0.01 * random_covariances(rng, n, 3))
     for _ in range(5):
         random_step(riccati, rng, 1e-4, 1e-2)
     return riccati
@@ -148,7 +146,7 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
         """The covariances of the residual after two blind motions of a second each."""
         settings = replace(PLAIN, two_d_mode=two_d_mode, landmark_velocity_stddev=1e-9)
         riccati = RiccatiGains(settings, np.eye(4))
-        riccati.add(SeenPoints(point, np.zeros((1, 3, 3))))
+        riccati.add(point, np.zeros((1, 3, 3)))
         riccati.observer.set_landmark_velocities(np.array([0]), velocity)
         propagate(riccati, V, dt_s, Q)
         propagate(riccati, V, dt_s, Q)
@@ -168,7 +166,7 @@ def test_an_observation_needs_no_more_memory_than_a_few_times_that_of_the_covari
     rng, rows = np.random.default_rng(0), np.arange(10)
     riccati = RiccatiGains(PLAIN, np.eye(4))
     points = rng.normal(size=(landmarks, 3))
-    riccati.add(SeenPoints(points, random_covariances(rng, landmarks, 3)))
+    riccati.add(points, random_covariances(rng, landmarks, 3))
     V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
     R = random_covariances(rng, len(rows), 3)
     tracemalloc.start()
@@ -191,7 +189,7 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     R = np.diag([1e-3, 2e-3, 3e-3])
     point = np.array([[2.0, -1.0, 0.0 if two_d_mode else 0.5]])
     riccati = RiccatiGains(replace(PLAIN, two_d_mode=two_d_mode), np.eye(4))
-    riccati.add(SeenPoints(point, R[None]))
+    riccati.add(point, R[None])
     propagate(riccati, V, np.full(pieces, 0.1), np.tile(Q, (pieces, 1, 1)))
     seen = se3.transform(se3.inverse(riccati.observer.A), point)
 
@@ -221,7 +219,7 @@ def test_observations_never_determine_where_the_worlds_frame_is(rng):
         riccati = RiccatiGains(PLAIN, np.eye(4))
         riccati.set_pose(np.eye(4), frame_covariance)
         points = random.normal(scale=4.0, size=(4, 3))
-        riccati.add(SeenPoints(points, 0.01 * random_covariances(random, 4, 3)))
+        riccati.add(points, 0.01 * random_covariances(random, 4, 3))
         for _ in range(20):
             random_step(riccati, random, 1e-4, 1e-2)
         return riccati
@@ -240,9 +238,7 @@ def test_covariance_stays_symmetric_and_positive_over_many_steps_of_any_noise(
 ):
     rng = np.random.default_rng(4)
     riccati = RiccatiGains(PLAIN, np.eye(4))
-    riccati.add(
-        SeenPoints(rng.normal(scale=4.0, size=(3, 3)), np.tile(1e-2 * np.eye(3), (3, 1, 1)))
-    )
+    riccati.add(rng.normal(scale=4.0, size=(3, 3)), np.tile(1e-2 * np.eye(3), (3, 1, 1)))
     steps, dt_s = 3_000, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
     Q = 10.0 ** rng.uniform(-10.0, -2.0, (steps, 1, 6, 1)) * np.eye(6)
@@ -290,9 +286,9 @@ def test_a_landmark_that_is_relocated_is_as_new_and_the_others_stay(rng):
     seed = rng.integers(2**32)
     relocated, added = (started(np.random.default_rng(seed)) for _ in range(2))
     point, R = rng.normal(size=(1, 3)), random_covariances(rng, 1, 3)
-    relocated.relocate(np.array([1]), SeenPoints(point, R))
+    relocated.relocate(np.array([1]), point, R)
     added.remove(np.array([1]))
-    added.add(SeenPoints(point, R))
+    added.add(point, R)
     order = np.array([0, 3, 1, 2])  # the one added last stands where the other one stood
     np.testing.assert_allclose(
         covariance_of_all(relocated), added.joint_covariance(order), atol=1e-12
@@ -394,11 +390,7 @@ def test_the_order_of_landmarks_in_a_message_does_not_matter():
 
 def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees():
     riccati = RiccatiGains(PLAIN, np.eye(4))
-    riccati.add(
-        SeenPoints(
-            np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1))
-        )
-    )
+    riccati.add(np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1)))
     # It takes itself to be at rest, but may have turned by 0.3 rad; it has turned by 0.6.
     Q = np.diag([1e-8, 1e-8, 0.3**2, 1e-4, 1e-4, 1e-4])
     propagate(riccati, np.zeros((1, 6)), np.ones(1), Q[None])

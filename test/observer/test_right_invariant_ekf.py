@@ -9,7 +9,6 @@ from scipy.linalg import block_diag, expm
 from strategies import generators
 
 from slam_observer_ros.geometry.so3 import hat
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 
 
@@ -94,7 +93,7 @@ def test_riccati_filter_is_the_right_invariant_ekf(rng):
         ekf.move(V * dt_s[:, None], Q)
         if number % 5 == 0:
             y, R = rng.normal(scale=4.0, size=(2, 3)), 1e-2 * random_covariances(rng, 2, 3)
-            riccati.add(SeenPoints(y, R))
+            riccati.add(y, R)
             ekf.add(y, R)
         n = len(riccati.observer.points)
         rows = np.sort(rng.permutation(n)[: rng.integers(1, n + 1)])
@@ -104,6 +103,6 @@ def test_riccati_filter_is_the_right_invariant_ekf(rng):
         ekf.correct(rows, y, R)
         if number % 7 == 6:
             moved, y = rng.integers(0, n, 1), rng.normal(scale=4.0, size=(1, 3))
-            riccati.relocate(moved, SeenPoints(y, R[:1]))
+            riccati.relocate(moved, y, R[:1])
             ekf.relocate(moved, y, R[:1])
         assert_same(riccati, ekf)

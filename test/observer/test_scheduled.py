@@ -27,7 +27,6 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.designs import DESIGNS
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.scheduled.core import CAPACITY
 from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
 from slam_observer_ros.observer.scheduled.scheduled import ScheduledGains
@@ -95,9 +94,7 @@ def landmarks_about_a_robot(rng, n):
     """Filter that has seen n landmarks twice, on a motion that left it unsure of its pose."""
     scheduled = ScheduledGains(PLAIN, np.eye(4))
     scheduled.set_pose(np.eye(4), 1e-4 * random_covariances(rng, 1, 6)[0])
-    scheduled.add(
-        SeenPoints(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
-    )
+    scheduled.add(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
     for _ in range(3):
         random_step(scheduled, rng, 1e-4, 1e-2)
     V, Q = rng.normal(size=(1, 6)), 1e-3 * random_covariances(rng, 1, 6)
@@ -212,9 +209,7 @@ def test_landmarks_wait_in_few_groups():
 def test_covariances_stay_positive_over_many_steps_of_any_noise(point_variance_exponents):
     rng, n = np.random.default_rng(4), 20
     scheduled = ScheduledGains(PLAIN, np.eye(4))
-    scheduled.add(
-        SeenPoints(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
-    )
+    scheduled.add(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
     steps, dt_s = 1_500, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
     Q = 10.0 ** rng.uniform(-10.0, -2.0, (steps, 1, 6, 1)) * np.eye(6)
@@ -267,8 +262,8 @@ def test_a_landmark_that_is_relocated_is_as_uncertain_as_a_new_one():
     rng, n = np.random.default_rng(2), 5
     relocated, added = (landmarks_about_a_robot(np.random.default_rng(3), n) for _ in range(2))
     point, R = rng.normal(size=(1, 3)), random_covariances(rng, 1, 3)
-    relocated.relocate(np.array([1]), SeenPoints(point, R))
-    added.add(SeenPoints(point, R))
+    relocated.relocate(np.array([1]), point, R)
+    added.add(point, R)
     np.testing.assert_allclose(relocated.observer.points[1], added.observer.points[n], atol=1e-12)
     of_one = np.append(np.arange(6), np.arange(9, 12))
     of_last = np.append(np.arange(6), 6 + 3 * n + np.arange(3))

@@ -12,7 +12,6 @@ from strategies import generators
 
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import SeenPoints
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.state.tag_orientations import flipped
 
@@ -24,7 +23,7 @@ def tag_filter(rng, n=3, settings=TAGS):
     """A filter with n tags, which then has moved."""
     tags = RiccatiGains(settings, np.eye(4))
     points = rng.normal(scale=4.0, size=(n, 3)) * [1.0, 1.0, not settings.two_d_mode]
-    tags.add(SeenPoints(points, 0.01 * random_covariances(rng, n, 3)))
+    tags.add(points, 0.01 * random_covariances(rng, n, 3))
     tags.add_orientations(seen(np.arange(n), so3.exp(rng.normal(size=(n, 3))), 0.05))
     move(tags, rng)
     return tags
@@ -69,9 +68,7 @@ def test_orientations_that_are_never_seen_leave_the_filter_of_points(rng):
 
     def run(filter_):
         random = np.random.default_rng(seed)
-        filter_.add(
-            SeenPoints(random.normal(scale=4.0, size=(4, 3)), random_covariances(random, 4, 3))
-        )
+        filter_.add(random.normal(scale=4.0, size=(4, 3)), random_covariances(random, 4, 3))
         for _ in range(5):
             move(filter_, random)
             rows = np.sort(random.permutation(4)[:2])
@@ -134,7 +131,7 @@ def test_no_orientation_tells_where_the_worlds_frame_is(rng):
 def test_one_tag_in_view_tells_the_heading_which_its_position_does_not():
     def heading_variance(with_orientation):
         tags = RiccatiGains(TAGS, np.eye(4))
-        tags.add(SeenPoints(np.array([[3.0, 0.0, 0.0]]), 1e-4 * np.eye(3)[None]))
+        tags.add(np.array([[3.0, 0.0, 0.0]]), 1e-4 * np.eye(3)[None])
         tags.add_orientations(seen(np.array([0]), np.eye(3)[None], 0.02))
         Q = np.diag([0.1, 0.1, 0.1, 0.3, 0.3, 0.3])[None]
         propagate(tags, np.zeros((1, 6)), np.array([1.0]), Q)
@@ -187,7 +184,7 @@ def look(tags, order, tag, y, Z, sigma_m, sigma_rad):
     R = np.array([sigma_m**2 * np.eye(3)])
     if tag not in order:
         order.append(tag)
-        tags.add(SeenPoints(y, R))
+        tags.add(y, R)
         tags.add_orientations(seen(np.array([len(order) - 1]), Z, sigma_rad))
         return
     row = np.array([order.index(tag)])
@@ -210,7 +207,7 @@ def test_of_an_orientation_and_its_twin_the_likelier_one_is_used_and_none_if_bot
     """With a heading known to 0.02 rad it is clear which of the two it is, to 0.3 rad it isn't."""
     tags, rows = RiccatiGains(TAGS, np.eye(4)), np.array([0])
     away, tilted = np.array([[4.0, 0.0, 0.0]]), so3.exp(np.array([[0.0, np.pi / 2 + 0.3, 0.0]]))
-    tags.add(SeenPoints(away, 1e-4 * np.eye(3)[None]))
+    tags.add(away, 1e-4 * np.eye(3)[None])
     tags.add_orientations(seen(rows, tilted, 0.02))
     Q = np.zeros((1, 6, 6))
     Q[0, :3, :3] = sigma_rad**2 * np.eye(3)

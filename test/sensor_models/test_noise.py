@@ -20,6 +20,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
@@ -183,7 +184,7 @@ def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
         history = VelocityHistory(10**9)
         for piece, velocity in enumerate(V):
             history.append(queued(VelocityEvent(piece * dt_ns, velocity)))
-        return history, Calibration(Settings(), SPATIAL)
+        return history, Calibration(FilterArrays(np.eye(4)), Settings(), SPATIAL)
 
     def error(piece, w):
         moved = V.copy()

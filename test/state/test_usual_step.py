@@ -52,7 +52,7 @@ def parts(state):
         state.motion_noise.factors,
         state.landmarks,
     )
-    latest = history._new[-1].keyframe if history._new else None
+    latest = history._new[-1] if history._new else None
     noise, sensitivity, drift = history._motion or history._at_rest()
     return {
         'A': state.observer.A,

@@ -27,7 +27,7 @@ from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
-from slam_observer_ros.observer.residuals import Residuals, SeenPoints
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
 from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
@@ -91,10 +91,17 @@ class RiccatiGains(OrientationGains):
         self.joint.propagate(motion, points, observer.u[active])
         self.motion_noise.factors.move(motion.noise_by_kind)
 
-    def residuals(self, rows: IntArray, seen: SeenPoints, dt_s: FloatArray) -> Residuals:
+    def residuals(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        dt_s: FloatArray,
+        D: FloatArray | None = None,
+    ) -> Residuals:
         """Return what landmarks (m,), which are going to correct the state, say against it."""
         self.joint.activate(rows)
-        return super().residuals(rows, seen, dt_s)
+        return super().residuals(rows, points, covariances, dt_s, D)
 
     def observe(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
@@ -131,18 +138,20 @@ class RiccatiGains(OrientationGains):
 
     def add_sensor(self, frame: str) -> None:
         """Let the calibration of the sensor of another frame be part of the state, and of P."""
-        sensor = self.calibration.add_sensor(frame)
-        if len(sensor.variances):
+        variances = self.calibration.add_sensor(frame)
+        if len(variances):
             self.joint = self.joint.dense()
-            self.joint.add_calibration(sensor.variances)
+            self.joint.add_calibration(variances)
             self._compress_if_large(0)
 
-    def add(self, seen: SeenPoints) -> None:
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks seen for the first time."""
-        self._compress_if_large(len(seen.points))
-        super().add(seen)
+        self._compress_if_large(len(points))
+        super().add(points, covariances)
         self.motion_noise.factors.forget_motion()  # until now, which is none of theirs
-        self.joint.add_seen(self.observer.turned(seen.covariances), seen.D)
+        self.joint.add_seen(self.observer.turned(covariances), D)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks whose errors are independent of all else, or only of all others."""
@@ -157,11 +166,17 @@ class RiccatiGains(OrientationGains):
         self.take_orientations(np.arange(n - len(known), n), known)
         self._compress_if_large(0)
 
-    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
         self.joint.activate(rows)
-        super().relocate(rows, seen)
-        self.joint.relocate(rows, self.observer.turned(seen.covariances), seen.D)
+        super().relocate(rows, points, covariances)
+        self.joint.relocate(rows, self.observer.turned(covariances), D)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""

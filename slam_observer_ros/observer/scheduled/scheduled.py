@@ -39,7 +39,7 @@ from slam_observer_ros.geometry.matrices import (
 from slam_observer_ros.observer.gains import Gains, OF_CONSTANT_GAINS, OF_JOINT_COVARIANCES
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals, SeenPoints
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import accepted, huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled.core import Core, regression
 from slam_observer_ros.sensor_models.calibration import without_sensor_calibration
@@ -132,11 +132,13 @@ class ScheduledGains(Gains):
         F, N, _ = self._postponed.now(residuals.rows)
         return self._distances(residuals, F, N)
 
-    def add(self, seen: SeenPoints) -> None:
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks (m,): their error is that of the pose and of the observation."""
-        super().add(seen)
-        y_ref = self.observer.y_ref[-len(seen.points) :]
-        noise = self.observer.turned(seen.covariances)
+        super().add(points, covariances)
+        y_ref = self.observer.y_ref[-len(points) :]
+        noise = self.observer.turned(covariances)
         self._postponed.add(self._output_matrix(y_ref), self._noise(noise))
 
     def add_known(self, known: KnownLandmarks) -> None:
@@ -145,10 +147,16 @@ class ScheduledGains(Gains):
         N = self._noise(known.covariances)
         self._postponed.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
 
-    def relocate(self, rows: IntArray, seen: SeenPoints) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones."""
-        super().relocate(rows, seen)
-        y_ref, noise = self.observer.y_ref[rows], self.observer.turned(seen.covariances)
+        super().relocate(rows, points, covariances)
+        y_ref, noise = self.observer.y_ref[rows], self.observer.turned(covariances)
         self._core.dismiss(rows)
         self._postponed.update(rows, self._output_matrix(y_ref), self._noise(noise))
 

@@ -1,0 +1,253 @@
+"""What a replay writes: trajectory, map and figures, smoothed or not, and what it replaces."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import re
+
+import numpy as np
+import pytest
+import recordings
+from tum_files import read_tum
+import yaml
+
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+
+
+class TestOutputs:
+    def test_trajectory_and_map_and_figures(self, slam_observer, simulated, tmp_path):
+        tum, landmarks, figures = tmp_path / 'run.tum', tmp_path / 'map.yaml', tmp_path / 'figures'
+        slam_observer.succeed(
+            'replay', simulated, '--tum', tum, '--map', landmarks, '--plot', figures
+        )
+        trajectory = read_tum(tum)
+        assert len(trajectory) == 84  # 20 Hz at most, of stamps every 20 ms: every 60 ms
+        assert np.diff(trajectory.stamps_ns).min() >= 50_000_000
+        content = yaml.safe_load(landmarks.read_text())
+        assert (content['version'], content['frame']) == (1, 'map')
+        assert [landmark['id'] for landmark in content['landmarks']] == [0, 1, 2, 3]
+        assert all(len(landmark['position']) == 3 for landmark in content['landmarks'])
+        assert content['landmarks'][0]['observations'] == 251
+        assert {path.name for path in figures.iterdir()} == {
+            'map.png', 'errors.png', 'residuals.png'
+        }  # fmt: skip
+
+    @pytest.mark.parametrize('kind', ['svg', 'pdf'])
+    def test_figures_are_of_the_kind_that_is_asked_for(
+        self, slam_observer, simulated, tmp_path, kind
+    ):
+        slam_observer.succeed('replay', simulated, '--plot', tmp_path / 'a', '--plot-format', kind)
+        names = {path.name for path in (tmp_path / 'a').iterdir()}
+        assert names == {f'{name}.{kind}' for name in ('map', 'errors', 'residuals')}
+
+    def test_people_read_degrees_and_programs_radians(self, slam_observer, simulated):
+        figures = slam_observer.succeed('replay', simulated, '--json').json
+        (row,) = (
+            line for line in slam_observer.succeed('replay', simulated).output.splitlines()
+            if 'heading error' in line
+        )  # fmt: skip
+        printed = float(re.search(r'([\d.e-]+) °', row).group(1))
+        assert printed == pytest.approx(np.degrees(figures['heading_rmse_rad']), rel=1e-2)
+
+    def test_map_states_what_the_gains_know_of_its_accuracy(
+        self, slam_observer, simulated, tmp_path
+    ):
+        for gains in ('constant', 'riccati'):
+            path = tmp_path / f'{gains}.yaml'
+            slam_observer.succeed('replay', simulated, '--gains', gains, '--map', path)
+            landmark = yaml.safe_load(path.read_text())['landmarks'][0]
+            if gains == 'constant':
+                assert 'covariance' not in landmark
+            else:
+                assert np.linalg.eigvalsh(landmark['covariance']).min() > 0.0
+
+    def test_nothing_is_overwritten_but_by_force(self, slam_observer, simulated, tmp_path):
+        figures = tmp_path / 'figures'
+        figures.mkdir()
+        files = {'--tum': tmp_path / 'a.tum', '--map': tmp_path / 'a.yaml', '--plot': figures}
+        for option, path in files.items():
+            mine = path / 'map.png' if path == figures else path
+            mine.write_text('mine')
+            assert '--force' in slam_observer.fail('replay', simulated, option, path)
+            assert mine.read_text() == 'mine'
+            slam_observer.succeed('replay', simulated, option, path, '--force')
+            assert b'mine' not in mine.read_bytes()[:4]
+
+    def test_what_is_read_is_not_replaced_even_by_force(
+        self, slam_observer, simulated, tmp_path, monkeypatch
+    ):
+        config, landmarks = tmp_path / 'robot.yaml', tmp_path / 'map.yaml'
+        config.write_text('/**: {ros__parameters: {gains: constant}}')
+        slam_observer.succeed('replay', simulated, '--map', landmarks)
+        before = [path.read_bytes() for path in (simulated, config, landmarks)]
+        monkeypatch.chdir(tmp_path)
+        arguments = ('replay', simulated, '--config', config, '--load-map', landmarks, '--force')
+        for option, name, what in (
+            ('--tum', simulated.name, str(simulated)),
+            ('--map', simulated, str(simulated)),
+            ('--tum', config, '--config'),
+            ('--map', config, '--config'),
+            ('--tum', landmarks, '--load-map'),
+        ):
+            error = slam_observer.fail(*arguments, option, name)
+            assert f'{option} {name} would replace' in error
+            assert what in error
+        assert [path.read_bytes() for path in (simulated, config, landmarks)] == before
+        assert slam_observer(*arguments, '--map', landmarks).code == 0
+
+    def test_files_of_a_recorded_directory_are_not_replaced_but_others_in_it_are(
+        self, slam_observer, run_in_every_format
+    ):
+        directory = run_in_every_format['sqlite3 directory']
+        for file in directory.iterdir():
+            before = file.read_bytes()
+            assert str(directory) in slam_observer.fail(
+                'replay', directory, '--force', '--map', file
+            )
+            assert file.read_bytes() == before
+        slam_observer.succeed('replay', directory, '--force', '--tum', directory / 'run.tum')
+        slam_observer.succeed('replay', directory, '--force', '--tum', directory / 'run.tum')
+
+    def test_what_can_not_be_written_loses_nothing_else(self, slam_observer, simulated, tmp_path):
+        too_long, landmarks = tmp_path / ('x' * 254), tmp_path / 'map.yaml'
+        arguments = ('replay', simulated, '--tum', too_long, '--map', landmarks)
+        ended = slam_observer(*arguments)
+        assert ended.code == 2
+        assert ended.errors.startswith('slam-observer: error: ')
+        assert 'name too long' in ended.errors.lower()
+        assert ended.errors.count('\n') == 1
+        assert landmarks.exists()
+        assert '(ATE)' in ended.output
+        assert 'trajectory' not in ended.output
+
+    def test_links_stay_links_to_what_is_written(self, slam_observer, simulated, tmp_path):
+        elsewhere = tmp_path / 'elsewhere'
+        elsewhere.mkdir()
+        names = 'a.tum', 'map.yaml', 'figures/map.png'
+        (tmp_path / 'figures').mkdir()
+        for name in names:
+            (elsewhere / Path(name).name).write_text('older')
+            (tmp_path / name).symlink_to(elsewhere / Path(name).name)
+        slam_observer.succeed(
+            'replay', simulated, '--force', '--tum', tmp_path / 'a.tum',
+            '--map', tmp_path / 'map.yaml', '--plot', tmp_path / 'figures',
+        )  # fmt: skip
+        for name in names:
+            assert (tmp_path / name).is_symlink()
+            assert b'older' not in (elsewhere / Path(name).name).read_bytes()
+        assert len(list(elsewhere.iterdir())) == 3
+
+    @pytest.mark.parametrize('option', ['--tum', '--map', '--plot'])
+    def test_what_is_no_file_is_not_replaced_even_by_force(
+        self, slam_observer, simulated, tmp_path, option
+    ):
+        pipe = tmp_path / 'map.png'
+        os.mkfifo(pipe)
+        path = tmp_path if option == '--plot' else pipe
+        error = slam_observer.fail('replay', simulated, '--force', option, path)
+        assert f'{pipe} is there, and no regular file' in error
+        assert pipe.is_fifo()
+
+    def test_two_names_of_one_file_are_not_two_outputs(self, slam_observer, simulated, tmp_path):
+        (tmp_path / 'link').symlink_to(tmp_path / 'map.yaml')
+        outputs = ('--tum', tmp_path / 'link', '--map', tmp_path / 'map.yaml')
+        assert 'two outputs' in slam_observer.fail('replay', simulated, *outputs)
+
+    def test_figures_that_can_not_be_written_are_named_as_asked_for(
+        self, slam_observer, simulated
+    ):
+        errors = slam_observer('replay', simulated, '--plot', '/proc/figures').errors
+        assert "can't write figures to /proc/figures: " in errors
+        assert 'unfinished' not in errors
+
+    def test_figures_of_an_earlier_replay_are_not_left_among_the_new_ones(
+        self, slam_observer, simulated, tmp_path
+    ):
+        slam_observer.succeed('replay', simulated, '--plot', tmp_path)
+        assert (tmp_path / 'errors.png').exists()
+        without_truth = recordings.write_events(tmp_path / 'run.mcap', recordings.events())
+        slam_observer.succeed('replay', without_truth, '--plot', tmp_path, '--force')
+        assert not (tmp_path / 'errors.png').exists()
+        assert (tmp_path / 'map.png').exists()
+
+    @pytest.mark.parametrize('option', ['--tum', '--map', '--plot'])
+    def test_where_nothing_may_be_written_is_reported_before_the_work(
+        self, slam_observer, simulated, tmp_path, option, monkeypatch
+    ):
+        monkeypatch.setattr(os, 'access', lambda *_: False)  # root may write anywhere
+        ended = slam_observer('replay', simulated, option, tmp_path / 'new')
+        assert (ended.code, ended.output) == (2, '')
+        assert f'nothing may be written to {tmp_path}' in ended.errors
+
+    def test_figures_leave_other_files_alone(self, slam_observer, simulated, tmp_path):
+        (tmp_path / 'notes.txt').write_text('mine')
+        slam_observer.succeed('replay', simulated, '--plot', tmp_path)
+        assert (tmp_path / 'notes.txt').read_text() == 'mine'
+        assert (tmp_path / 'map.png').exists()
+        assert not list(tmp_path.glob('.*'))
+
+
+class TestSmoothing:
+    def test_outputs_are_of_the_smoothed_trajectory_and_map(
+        self, slam_observer, simulated, tmp_path
+    ):
+        online_tum = tmp_path / 'online.tum'
+        online = slam_observer.succeed(
+            'replay', simulated, '--gains', 'riccati', '--json', '--tum', online_tum
+        ).json
+        tum, landmarks, figures = tmp_path / 'a.tum', tmp_path / 'a.yaml', tmp_path / 'figures'
+        report = slam_observer.succeed(
+            'replay', simulated, '--gains', 'riccati', '--json', '--smooth',
+            '--tum', tum, '--map', landmarks, '--plot', figures,
+        ).json  # fmt: skip
+        assert report['ate_rmse_m'] == online['ate_rmse_m']
+        assert report['smoothed_ate_rmse_m'] < online['ate_rmse_m']
+        assert report['smoothed_landmark_rmse_m'] is not None
+        assert report['unsmoothed_ate_rmse_m'] == online['ate_rmse_m']
+        # At the same stamps, also where nothing is seen.
+        np.testing.assert_array_equal(read_tum(tum).stamps_ns, read_tum(online_tum).stamps_ns)
+        assert len(yaml.safe_load(landmarks.read_text())['landmarks']) == 4
+        assert len(list(figures.iterdir())) == 3
+
+    def test_gains_without_a_history_can_not_smooth(self, slam_observer, simulated):
+        error = slam_observer.fail('replay', simulated, '--smooth', '--gains', 'constant')
+        assert 'riccati' in error
+
+    def test_history_that_is_cut_short_is_reported(self, slam_observer, simulated):
+        ended = slam_observer(
+            'replay', simulated, '--smooth', '--gains', 'riccati',
+            '--set', 'relinearization_angle=0', '--set', 'relinearization_interval=10',
+            '--set', 'smoothing_window=20',
+        )  # fmt: skip
+        assert ended.code == 0
+        assert 'of the part that is smoothed, online' in ended.output
+        assert 'smoothing_window=0' in ended.errors
+
+    def test_all_of_a_long_recording_is_smoothed(self, slam_observer, tmp_path):
+        count, points = 3100, np.array([[2.0, 1.0, 0.0], [0.0, 3.0, 1.0], [-1.0, -2.0, 0.0]])
+        stamps_ns = range(10**9, 10**9 + count * 10**7, 10**7)
+        events = [VelocityEvent(stamp_ns, np.zeros(6)) for stamp_ns in stamps_ns]
+        events += [ObservationEvent(stamp_ns, np.arange(3), points) for stamp_ns in stamps_ns]
+        path = recordings.write_events(
+            tmp_path / 'long.mcap', sorted(events, key=lambda e: e.stamp_ns)
+        )
+        tum = tmp_path / 'a.tum'
+        slam_observer.succeed('replay', path, '--smooth', '--gains', 'riccati', '--tum', tum)
+        assert read_tum(tum).stamps_ns[0] == stamps_ns[0]
+
+    def test_messages_without_any_point_cut_no_history_short(self, slam_observer, tmp_path):
+        path = recordings.write_events(
+            tmp_path / 'blind.mcap', recordings.blinded(recordings.events(), slice(20, 40))
+        )
+        ended = slam_observer.succeed('replay', path, '--smooth', '--gains', 'riccati')
+        assert 'history' not in ended.errors
+
+    def test_where_no_point_is_seen_nothing_is_smoothed(self, slam_observer, tmp_path):
+        path = recordings.write_events(
+            tmp_path / 'blind.mcap', recordings.blinded(recordings.events(), slice(None))
+        )
+        tum = tmp_path / 'a.tum'
+        error = slam_observer.fail('replay', path, '--smooth', '--gains', 'riccati', '--tum', tum)
+        assert 'no observation was used (dropped: 50 without a point that is used)' in error
+        assert not tum.exists()
