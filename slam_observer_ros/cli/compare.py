@@ -18,8 +18,9 @@ from slam_observer_ros.cli.replay_request import (
     read_request,
     Records,
     ReplayRequest,
+    select_inputs,
 )
-from slam_observer_ros.cli.replay_run import replayed, select_inputs
+from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.evaluation.drawing import SUFFIXES
 from slam_observer_ros.evaluation.map_plot import plot_overlay
