@@ -27,6 +27,8 @@ class Kind:
 
 
 NOISE = 'state more noise (Tune the noise)'
+POSE_DIFFERENCES = 'set velocity_source: pose_differences (in replay --velocity-source)'
+GIVE_THE_POSE = 'drive on, or give the pose (on initialpose, or by set_initial_pose)'
 INPUTS = (
     'look at the signs, units and frames of the velocity and of the points, then at their noise, '
     'and in a loaded map whether that is still true'
@@ -123,7 +125,7 @@ KINDS = {
     ),
     'malformed_message': Kind(
         Level.WARNING,
-        '{path}: malformed message on {topic}: {error}',
+        'malformed message on {topic}: {error}',
         'see whether all of them are, by the count of these (Troubleshooting)',
     ),
     'several_robots': Kind(
@@ -173,11 +175,9 @@ KINDS = {
     'zero_twist': Kind(
         Level.WARNING,
         'all velocities on {topic} are zero, but its poses move',
-        'try --velocity-source pose_differences',
+        POSE_DIFFERENCES,
     ),
-    'wrong_twist': Kind(
-        Level.WARNING, 'the twist on {topic} {problem}', 'try --velocity-source pose_differences'
-    ),
+    'wrong_twist': Kind(Level.WARNING, 'the twist on {topic} {problem}', POSE_DIFFERENCES),
     # The velocity, its calibration and noise
     'stale_velocity': Kind(
         Level.WARNING,
@@ -276,10 +276,11 @@ KINDS = {
     'unknown_pose': Kind(
         Level.WARNING,
         'the pose in the loaded map is not known yet: no pose is published',
-        'drive on, or give it on initialpose or by set_initial_pose',
+        GIVE_THE_POSE,
     ),
-    'ambiguous_pose': Kind(
-        Level.WARNING, '{problem} on initialpose', 'drive on, or give it there'
+    'no_place': Kind(Level.WARNING, 'what was seen fits no place in {where} yet', GIVE_THE_POSE),
+    'ambiguous_place': Kind(
+        Level.WARNING, 'what was seen fits {number} in {where}, {places}', GIVE_THE_POSE
     ),
     'lost_pose': Kind(
         Level.WARNING,

@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
@@ -26,11 +27,10 @@ from slam_observer_ros.estimator.event_queue import EventQueue
 from slam_observer_ros.estimator.event_warnings import EventWarnings, UNEXPECTED_POSES
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
 from slam_observer_ros.events import (
-    AngularVelocityEvent,
     Event,
+    MeasuredVelocity,
     ObservationEvent,
     Queued,
-    queued,
     UNKNOWN_ID,
     VelocityBlock,
 )
@@ -229,7 +229,7 @@ class Estimator:
         """
         try:
             check_event(event, self.settings)
-            self._take(queued(event))
+            self._take(event)
         except InvalidEventError as error:
             self._drop(error)
             return False
@@ -272,7 +272,7 @@ class Estimator:
         """
         end_s = time.monotonic() + limit_s
         for ready in self._queue.pop_believed():
-            events = ready.one_by_one() if isinstance(ready, VelocityBlock) else (ready,)
+            events = ready.events() if isinstance(ready, VelocityBlock) else (ready,)
             for event in events:
                 if time.monotonic() > end_s:
                     self._drop(InvalidEventError('stopped', 'held back when the end came'))
@@ -320,8 +320,8 @@ class Estimator:
         return self._localiser.is_localised
 
     @property
-    def localisation_problem(self) -> str:
-        """Why the pose in a loaded map is not known; empty if it is."""
+    def localisation_problem(self) -> Finding | None:
+        """Why the pose in a loaded map is not known; None if it is."""
         return self._localiser.problem(self._state.observer.A)
 
     @property
@@ -506,24 +506,19 @@ class Estimator:
 
     def _process(self, item: Queued) -> None:
         """Use what has its turn: what is of one stamp, or velocities that follow each other."""
-        if isinstance(item, VelocityBlock):
-            for part in self._timeline.parts(item):
-                self._report_before(part.stamp_ns)
-                self._process_velocities(part, len(part))
-                if self._on_stamps is not None and len(part) > 1:
-                    self._on_stamps(part.stamps_ns[:-1])
-                self._timeline.advance_after_many()
-            return
-        self._report_before(item.stamp_ns)
         if isinstance(item, ObservationEvent):
+            if self._on_stamps is not None:
+                self._report_before(item.stamp_ns)
             self._process_observation(item)
+        elif isinstance(item, VelocityBlock):
+            for part in self._timeline.parts(item):
+                self._process_velocity(part)
         else:
-            self._process_velocities(item, 1)
-            self._timeline.advance_after_many()
+            self._process_velocity(item)
 
     def _report_before(self, stamp_ns: int) -> None:
         """Report the present stamp if the next event is of a later one."""
-        if self._on_stamps is not None and stamp_ns > (self.stamp_ns or 0):
+        if stamp_ns > (self.stamp_ns or 0):
             self._report_stamp()
 
     def _report_stamp(self) -> None:
@@ -531,10 +526,11 @@ class Estimator:
         if self._on_stamps is not None and self.stamp_ns is not None:
             self._on_stamps(np.array([self.stamp_ns]))
 
-    def _process_velocities(
-        self, measured: VelocityBlock | AngularVelocityEvent, count: int
-    ) -> None:
-        is_late = self._timeline.is_late(measured)
+    def _process_velocity(self, measured: MeasuredVelocity) -> None:
+        """Use one velocity, or several that follow each other."""
+        count = len(measured) if isinstance(measured, VelocityBlock) else 1
+        if self._on_stamps is not None:
+            self._report_before(measured.stamp_ns)
         try:
             is_used = self._timeline.append(measured)
         except InvalidEventError as error:
@@ -542,9 +538,12 @@ class Estimator:
             return
         if is_used:
             self._counts['velocity'] += count
-        if is_late:
+        if self._timeline.was_late:
             self._counts['late_velocity'] += 1
             self._warnings.warn('late_velocity')
+        if self._on_stamps is not None and isinstance(measured, VelocityBlock) and count > 1:
+            self._on_stamps(measured.stamps_ns[:-1])
+        self._timeline.advance_after_many()
 
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -173,20 +173,20 @@ class Localiser:
         finder = self._finder
         return [] if finder is None or finder.places is None else finder.places.all
 
-    def problem(self, A: FloatArray) -> str:
-        """Return why the pose in the map is not known, by Â (4, 4); empty if it is."""
+    def problem(self, A: FloatArray) -> Finding | None:
+        """Return why the pose in the map is not known, by Â (4, 4); None if it is."""
         if self.is_localised:
-            return ''
+            return None
         places = [place for place in self.places if place.share > LEAST_SHARE]
         if not places:
-            return f'what was seen fits no place in {self._where} yet: drive on, or give the pose'
+            return found('no_place', where=self._where)
         fits = ' and '.join(self._name(place, A) for place in places[:MAX_NAMED])
         if len(places) > MAX_NAMED:
             fits += f' and {len(places) - MAX_NAMED} more'
         elif len(places) == 1:
             fits += f', right with a probability of {places[0].share:.2f}'
         number = f'{len(places)} places' if len(places) > 1 else 'one place'
-        return f'what was seen fits {number} in {self._where}, {fits}: drive on, or give the pose'
+        return found('ambiguous_place', number=number, where=self._where, places=fits)
 
     def _find(self, state: State) -> None:
         """Find the pose by landmarks without ids."""
@@ -196,9 +196,9 @@ class Localiser:
             from slam_observer_ros.known_map.finder import Finder  # which few runs need
 
             self._finder = Finder(self.maps, state, self._rough)
-        found, places = self._finder.find(state), self._finder.places
-        if found is not None and places is not None and enter_map(state, *found):
-            self.loaded, (rows, _) = found
+        fit, places = self._finder.find(state), self._finder.places
+        if fit is not None and places is not None and enter_map(state, *fit):
+            self.loaded, (rows, _) = fit
             self.is_localised = True
             logger.info(
                 'Found the pose in the map%s by %d of %d landmarks (wrong with a probability of '
@@ -210,8 +210,7 @@ class Localiser:
             )
         elif not self._said_problem and len([p for p in self.places if p.share > LEAST_SHARE]) > 1:
             self._said_problem = True
-            problem = self.problem(state.observer.A)
-            logger.warning('%s%s.', problem[0].upper(), problem[1:])
+            logger.warning('%s', self.problem(state.observer.A))
 
     def enter(self, state: State) -> bool:
         """Move an estimate into the frame of a loaded map, if landmarks with ids suffice."""

@@ -293,8 +293,8 @@ class Recording:
             return decode(raw)
         except MessageError as error:
             if raw.topic.name not in self.malformed:
-                finding = found('malformed_message', path=self.path, topic=raw.topic, error=error)
-                logger.warning('%s', finding)
+                topic = f'{raw.topic.name} of {self.path}'
+                logger.warning('%s', found('malformed_message', topic=topic, error=error))
             self.malformed[raw.topic.name] += 1
             return None
 

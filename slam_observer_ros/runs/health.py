@@ -275,6 +275,13 @@ def of_left_out(counts: Counter[str], level: Level) -> list[Finding]:
     return [replace(finding, level=level)]
 
 
+def of_stamps(unstamped: Counter[str]) -> list[Finding]:
+    """Report topics whose messages, so many of each, came without a stamp."""
+    if not unstamped:
+        return []
+    return [found('zero_stamps', topics=', '.join(unstamped), count=unstamped.total())]
+
+
 def of_map(counts: Counter[str], *, is_start_given: bool) -> Iterator[Finding]:
     """Judge whether a map that does not grow is that of the place."""
     share = point_share(counts, 'unmapped_landmark')

@@ -12,6 +12,7 @@ from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
 from slam_observer_ros.recording.contents import Arrivals
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.runs.health import of_stamps
 from slam_observer_ros.runs.replay import Replay
 from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -105,9 +106,7 @@ def of_recording(
         yield found('clock_jumped', seconds=seconds, count=result.resets)
     if recording.loss and not recording.warning:
         yield found('damaged', path=recording.path, loss=recording.loss)
-    if recording.unstamped:
-        topics, count = ', '.join(recording.unstamped), recording.unstamped.total()
-        yield found('zero_stamps', topics=topics, count=count)
+    yield from of_stamps(recording.unstamped)
     if inputs.velocity_source != POSE_DIFFERENCES:
         yield from _of_poses(recording, selected, result)
 

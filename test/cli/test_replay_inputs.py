@@ -8,7 +8,7 @@ import pytest
 import ros_messages as ros
 from tum_files import read_tum
 
-from slam_observer_ros.evaluation.run_record import LandmarkTruth, PoseTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.reader import Recording
@@ -263,7 +263,7 @@ class TestVelocities:
                 if stamp_ns == ros.STAMP_NS:
                     drive.landmarks(stamp_ns)
         errors = slam_observer('replay', path).errors
-        assert errors.count('try --velocity-source pose_differences') == moves
+        assert errors.count('set velocity_source: pose_differences') == moves
         again = slam_observer('replay', path, '--velocity-source', 'pose_differences')
         assert again.errors == ''
 

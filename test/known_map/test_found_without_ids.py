@@ -63,8 +63,9 @@ class TestWithoutIds:
         add(estimator, events)
         assert not estimator.is_localised
         assert len(estimator.possible_poses) == 2
-        assert 'fits 2 places in the map, (' in estimator.localisation_problem
+        assert 'fits 2 places in the map, (' in estimator.localisation_problem.what
         assert caplog.text.count('hat was seen fits 2 places') == 1
+        assert str(estimator.localisation_problem)[-50:] in caplog.text
         # Within 3 m and 40 degrees.
         rough = np.diag([0.0, 0.0, 0.7, 3.0, 3.0, 0.0]) ** 2
         estimator.reset()
@@ -185,8 +186,8 @@ class TestSeveralMaps:
         estimator.load_map(alike)
         add(estimator, [without_ids(event) for event in worlds[0].drive(0.0, 2.0, count=8)])
         assert not estimator.is_localised
-        problem = estimator.localisation_problem
-        for text in ('2 places in the 3 maps', 'rad) in hall_0 and (', 'rad) in its_twin:'):
+        problem = estimator.localisation_problem.what
+        for text in ('2 places in the 3 maps', 'rad) in hall_0 and (', 'rad) in its_twin'):
             assert text in problem
         assert len(estimator.possible_poses) == 2
 

@@ -29,6 +29,7 @@ import ros_messages
 from sensor_msgs.msg import Imu, PointCloud2
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
@@ -216,8 +217,9 @@ def test_an_odometry_with_poses_alone_is_reported_once(velocity, speed, is_logge
         assert_allclose(decode(serialize_message(message), 0).body_velocity, velocity)
     logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
     assert len(logged) == is_logged
-    assert all("all velocities on '/robot/twist' are zero" in text for text in logged)
-    assert all("velocity_source to 'pose_differences'" in text for text in logged)
+    finding = found('zero_twist', topic="'/robot/twist'")
+    assert decode.doubt == (finding if is_logged else None)
+    assert all(text == finding.text() for text in logged)
 
 
 def test_that_the_velocities_of_an_odometry_are_missing_is_said_until_they_come():
@@ -230,9 +232,27 @@ def test_that_the_velocities_of_an_odometry_are_missing_is_said_until_they_come(
     for step in range(5):
         message = odometry(step * SECOND, 0, np.zeros(6))
         receive(serialize_message(message), {'received_timestamp': 0})
-    assert source.problem.startswith("all velocities on '/robot/twist' are zero")
+    assert source.doubt.what == "all velocities on '/robot/twist' are zero, but its poses move"
     receive(serialize_message(odometry(5 * SECOND, 0)), {'received_timestamp': 0})
-    assert not source.problem
+    assert source.doubt is None
+
+
+def test_a_message_that_cannot_be_read_is_said_as_a_recordings_is():
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    node.get_clock.return_value = FakeClock()
+    source = InputTopic(
+        node, 'twist', {ODOMETRY: chosen_inputs.OdometryDecoder(node)}, Mock(), QOS
+    )
+    receive = node.create_subscription.call_args.args[2]
+    assert source.last_malformed is None
+    receive(serialize_message(odometry(0, 0))[:40], {'received_timestamp': 0})
+    assert source.last_malformed.kind == 'malformed_message'
+    assert source.last_malformed.what.startswith("malformed message on '/robot/twist': ")
+    (source._log._next_s, source._log._quiet_until_s) = {}, 0.0
+    receive(serialize_message(odometry(0, 0))[:40], {'received_timestamp': 0})
+    (logged,) = (call.args[0] for call in node.get_logger().warning.call_args_list)
+    assert logged == source.last_malformed.text(' (2 so far)')
 
 
 def landmarks_input(type_name, feed=None, **settings):
@@ -624,6 +644,6 @@ def test_a_twist_along_the_axes_of_the_odometrys_frame_is_reported_once():
         message.twist.twist.linear.y = 0.5
         decode(serialize_message(message), 0)
     (text,) = (call.args[0] for call in node.get_logger().warning.call_args_list)
-    assert text == decode.problem
-    assert text.startswith("the twist on '/robot/twist' is along the axes of 'odom'")
-    assert text.endswith("set velocity_source to 'pose_differences'")
+    assert text == decode.doubt.text()
+    assert decode.doubt.kind == 'wrong_twist'
+    assert text.startswith("The twist on '/robot/twist' is along the axes of 'odom'")

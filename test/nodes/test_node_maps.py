@@ -21,6 +21,7 @@ from scipy.stats import chi2
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
@@ -29,10 +30,10 @@ from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.estimate_messages import StateMessages, uncertain_pose
 from slam_observer_ros.messages.poses import pose_matrices
+from slam_observer_ros.nodes.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.observer_nodes import ObserverNode
-from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
@@ -540,7 +541,7 @@ def test_with_wrong_parameters_the_node_says_why_and_does_not_start(
 def test_points_without_ids_that_fit_nowhere_in_a_map_are_reported(ros, robot, tmp_path):
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
     surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(5))
-    message = 'fits no place in the map yet: drive on, or give the pose on initialpose'
+    message = found('no_place', where='the map').what
 
     def is_reported():
         return diagnostics and message in diagnostics[-1].status[0].message

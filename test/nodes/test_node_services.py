@@ -24,6 +24,7 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import decode_point_cloud2
@@ -274,6 +275,9 @@ def is_moving(values):
     )
 
 
+NO_PLACE = found('no_place', where='the map')
+
+
 class Publishing:
     """The status that diagnostics publish of an estimator's counts."""
 
@@ -287,11 +291,11 @@ class Publishing:
             counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
             calibration=[], motion_factors=[], lyapunov=0.0, stamp_ns=None,
             velocity_is_stale=False, is_localised=True,
-            localisation_problem='what was seen fits 2 places', possible_poses=np.empty((0, 4, 4)),
+            localisation_problem=NO_PLACE, possible_poses=np.empty((0, 4, 4)),
         )  # fmt: skip
         vars(self.estimator).update(estimate)
         self.feed = SimpleNamespace(
-            dropped=Counter(), is_paused=False, clock_problems=list,
+            dropped=Counter(), unstamped=Counter(), is_paused=False, clock_problems=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
         self.estimate_publisher = SimpleNamespace(
@@ -379,7 +383,6 @@ def test_of_points_left_out_for_their_ids_a_single_one_is_reported(reason):
 
 
 NO_POSE = 'the pose in the loaded map is not known yet: no pose is published'
-NO_IDS = 'what was seen fits 2 places on initialpose'
 
 
 @pytest.mark.parametrize(
@@ -389,7 +392,10 @@ NO_IDS = 'what was seen fits 2 places on initialpose'
         ({'velocity_is_stale': True, 'stamp_ns': 1}, 'no velocity in force: the pose is held'),
         ({'is_localised': False}, NO_POSE),
         ({'is_localised': False, 'landmark_ids': [7]}, NO_POSE),
-        ({'is_localised': False, 'landmark_ids': [FIRST_AUTOMATIC_ID]}, f'{NO_POSE}; {NO_IDS}'),
+        (
+            {'is_localised': False, 'landmark_ids': [FIRST_AUTOMATIC_ID]},
+            f'{NO_POSE}; {NO_PLACE.what}',
+        ),
     ],
 )
 def test_what_is_amiss_with_the_estimate_is_reported_and_nothing_else(estimate, message):
@@ -416,8 +422,9 @@ def test_an_input_is_judged_by_what_came_since_the_last_time(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr(node_diagnostics.time, 'monotonic', lambda: now_s[0])
     source = SimpleNamespace(
-        name='twist', topic='/twist', received=0, age_s=None, malformed=0, problem='',
+        name='twist', topic='/twist', received=0, age_s=None, malformed=0, problem='', doubt=None,
         backlog=SimpleNamespace(wait_s=0.0), shedding=SimpleNamespace(shed=0),
+        last_malformed=found('malformed_message', topic="'/twist'", error='too short'),
     )  # fmt: skip
     publishing, messages, rates = Publishing(source), [], []
     for received, malformed, age_s in [(0, 0, None), (40, 2, 0.1), (60, 2, 0.1), (60, 2, 3.0)]:
@@ -427,7 +434,7 @@ def test_an_input_is_judged_by_what_came_since_the_last_time(monkeypatch):
         assert status.level != DiagnosticStatus.ERROR
         messages.append(status.message)
         rates.append(values_of(status)['/twist rate [Hz]'])
-    dropped = '2 messages dropped (malformed)'
+    dropped = "2 messages dropped (malformed); malformed message on '/twist': too short"
     assert messages == ['running', dropped, 'running', "no message on '/twist'"]
     assert rates == ['0.0', '20.0', '10.0', '0.0']
     now_s[0] += 2.0
@@ -439,7 +446,9 @@ def test_an_input_of_which_nothing_was_ever_used_is_an_error():
     """As landmarks in a frame that /tf does not have, beside good odometry."""
     source = SimpleNamespace(
         name='landmarks', topic='/tags', received=MANY_UNUSED, age_s=0.1, malformed=0, problem='',
+        doubt=None,
         backlog=SimpleNamespace(wait_s=0.0), shedding=SimpleNamespace(shed=0),
+        last_malformed=found('malformed_message', topic="'/twist'", error='too short'),
     )  # fmt: skip
     publishing = Publishing(source)
     assert publishing.publish(velocity=5).message == 'running', 'they may have come during a pause'

@@ -10,7 +10,7 @@ import sys
 import pytest
 import threadpoolctl
 
-from slam_observer_ros.common.computing import CHOICES
+from slam_observer_ros.common.process import CHOICES
 from slam_observer_ros.estimator import estimator  # noqa: F401  # loads what computes in threads
 
 NODE = """
@@ -27,7 +27,7 @@ LIBRARY = """
 import slam_observer_ros.estimator.estimator
 """
 PROGRAM = """
-from slam_observer_ros.common.computing import use_one_thread
+from slam_observer_ros.common.process import use_one_thread
 use_one_thread()
 from slam_observer_ros import Estimator
 """

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.inputs.odometry import OdometryCheck
@@ -158,8 +159,8 @@ class OdometryDecoder:
 
     Attributes
     ----------
-    problem : str
-        What is wrong with them; empty until it is seen, and, where all were zero, once one is not.
+    doubt : Finding or None
+        What is wrong with them; None until it is seen, and, where all were zero, once one is not.
 
     """
 
@@ -168,7 +169,7 @@ class OdometryDecoder:
         self._topic = node.resolve_topic_name('twist')
         self._gives_velocities = False
         self._check = OdometryCheck(uses_turn)
-        self.problem = ''
+        self.doubt: Finding | None = None
         self._first: FloatArray | None = None
 
     def __call__(self, raw: Buffer, receive_ns: int) -> VelocityEvent:
@@ -179,24 +180,24 @@ class OdometryDecoder:
         elif not self._check.is_decided:
             self._check.add(pose, velocity)
             if self._check.problem:
-                self._warn(f"the twist on '{self._topic}' {self._check.problem}")
+                self._warn('wrong_twist', problem=self._check.problem)
         return velocity
 
     def _look_for_velocities(self, pose: PoseMessage, event: VelocityEvent) -> None:
         # One that has given a velocity will do so again.
         self._gives_velocities = bool(event.body_velocity.any())
         if self._gives_velocities:
-            self.problem = ''
-        if self._gives_velocities or self.problem or pose.problem:  # nobody asked for its pose
+            self.doubt = None
+        if self._gives_velocities or self.doubt or pose.problem:  # nobody asked for its pose
             return
         if self._first is None:
             self._first = pose.position
         if np.linalg.norm(pose.position - self._first) > MOVED_M:
-            self._warn(f"all velocities on '{self._topic}' are zero, but its poses move")
+            self._warn('zero_twist')
 
-    def _warn(self, problem: str) -> None:
-        self.problem = f"{problem}: set velocity_source to 'pose_differences'"
-        self._node.get_logger().warning(self.problem)
+    def _warn(self, kind: str, **figures: object) -> None:
+        self.doubt = found(kind, topic=f"'{self._topic}'", **figures)
+        self._node.get_logger().warning(self.doubt.text())
 
 
 class TagDecoder:

@@ -11,6 +11,7 @@ import time
 from rclpy.node import Node
 
 from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
@@ -29,7 +30,7 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.clouds import scan_problem
 from slam_observer_ros.nodes.guarded_node import described, ThrottledLog
-from slam_observer_ros.nodes.intake.clocks import ClockChange, ClockOffset
+from slam_observer_ros.nodes.intake.lateness import ClockChange, ClockOffset
 from slam_observer_ros.settings.input_settings import ON_TF
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
@@ -63,6 +64,8 @@ class EstimatorFeed:
     ----------
     dropped : Counter
         Messages that did not become events, by reason.
+    unstamped : Counter
+        Messages without a stamp, by topic.
     clocks : dict of str to ClockOffset
         How far off the stamps are, by input.
     is_active : bool
@@ -95,6 +98,7 @@ class EstimatorFeed:
         self._processing_s = 0.0
         self._processed = 0
         self.dropped: Counter[str] = Counter()
+        self.unstamped: Counter[str] = Counter()
         self.clocks = {
             name: ClockOffset(to_ns(settings.max_clock_offset)) for name in SOURCES.values()
         }
@@ -152,8 +156,10 @@ class EstimatorFeed:
         if not self._is_usable(name, timed, receive_ns):
             return
         if timed is not measured:
-            reason = f'stamps are zero on {self._topics[name]}'
-            self._log.warning(reason, f'{reason}: the time of reception is taken instead')
+            topic = self._topics[name]
+            self.unstamped[topic] += 1
+            finding = found('zero_stamps', topics=topic, count=self.unstamped[topic])
+            self._log.warning(f'stamps of {topic}', finding.text())
         self._give(self._builder.add(timed, time.monotonic_ns()), name)
 
     def add_observation(self, measured: ObservationEvent, receive_ns: int) -> None:
@@ -276,4 +282,5 @@ class EstimatorFeed:
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
         count = self.dropped[reason]
-        self._log.warning(reason, f'Dropped a message, {reason}: {text} ({count} so far).')
+        finding = found('dropped_message', reason=reason, error=text)
+        self._log.warning(reason, finding.text(f' ({count} so far)'))

@@ -14,11 +14,12 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.intake.load import Backlog, LoadShedding, Waiting
+from slam_observer_ros.nodes.intake.lateness import Backlog, LoadShedding, Waiting
 from slam_observer_ros.nodes.message_classes import message_class
 
 DISCOVERY_S = 5.0
@@ -92,6 +93,8 @@ class InputTopic(Generic[MessageT]):
         Topic name after remapping.
     received, malformed : int
         Messages so far, and how many could not be decoded.
+    last_malformed : Finding or None
+        What was wrong with the last one of these.
     shedding : LoadShedding
         What is dropped, and how much was, as they come faster than they can be used.
     advice : mapping of str to str
@@ -132,6 +135,7 @@ class InputTopic(Generic[MessageT]):
         self.topic = node.resolve_topic_name(name)
         self.received = 0
         self.malformed = 0
+        self.last_malformed: Finding | None = None
         self._fault = ''
         self.backlog = Backlog()
         self.shedding = LoadShedding(max_wait_s)
@@ -161,9 +165,12 @@ class InputTopic(Generic[MessageT]):
         if age_s > DISCOVERY_S:
             return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
         now_s = time.monotonic()
-        if doubt := getattr(self._decoders.get(self._type_name), 'problem', ''):
-            return str(doubt)
         return self.shedding.problem(self.topic, now_s) or self.backlog.problem(self.topic, now_s)
+
+    @property
+    def doubt(self) -> Finding | None:
+        """What the decoder finds wrong with what messages say; None if nothing."""
+        return getattr(self._decoders.get(self._type_name), 'doubt', None)
 
     def check_publishers(self) -> None:
         """See what the topic carries; subscribe to it, or report why nothing comes.
@@ -176,8 +183,8 @@ class InputTopic(Generic[MessageT]):
             return
         self._checked_s = now_s
         publishers = self._node.get_publishers_info_by_topic(self.topic)
-        found = {publisher.topic_type for publisher in publishers}
-        usable = [name for name in self._decoders if name in found]
+        types = {publisher.topic_type for publisher in publishers}
+        usable = [name for name in self._decoders if name in types]
         missing = ''
         if usable and self._type_name not in usable:
             # A topic has one type at a time, and the executor lets go of the old one after this.
@@ -186,7 +193,7 @@ class InputTopic(Generic[MessageT]):
             else:
                 self.close()
         self._fault = missing or self._find_fault(publishers, usable)
-        if problem := self.problem:
+        if problem := self.problem or (self.doubt and self.doubt.text()):
             self._log.warning(self.topic, problem)
 
     def close(self) -> None:
@@ -262,7 +269,9 @@ class InputTopic(Generic[MessageT]):
             message = self._decoders[self._type_name](raw, receive_ns)
         except MessageError as error:
             self.malformed += 1
-            self._log.warning(self.topic, f"malformed message on '{self.topic}' dropped: {error}")
+            finding = found('malformed_message', topic=f"'{self.topic}'", error=error)
+            self.last_malformed = finding
+            self._log.warning(self.topic, finding.text(f' ({self.malformed} so far)'))
             return []
         return [Waiting(message, self._received_ns, receive_ns)]
 
@@ -292,9 +301,9 @@ class InputTopic(Generic[MessageT]):
         if not publishers:
             return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
         if not usable:
-            found = sorted({publisher.topic_type for publisher in publishers})
-            hint = ''.join(f'; set {self.advice[t]}' for t in found if t in self.advice)
-            return f"'{self.topic}' carries {', '.join(found)}; {wanted} is needed{hint}"
+            types = sorted({publisher.topic_type for publisher in publishers})
+            hint = ''.join(f'; set {self.advice[t]}' for t in types if t in self.advice)
+            return f"'{self.topic}' carries {', '.join(types)}; {wanted} is needed{hint}"
         if not self.is_shared and (text := rivals(self.topic, publishers)):
             return text
         for publisher in publishers:

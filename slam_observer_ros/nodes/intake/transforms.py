@@ -9,6 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 
 from slam_observer_ros.common.errors import MessageError, TransformError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import ALWAYS_NS, insert_transforms, TransformBuffer
@@ -81,7 +82,8 @@ class LiveTransforms:
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
-                self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
+                finding = found('malformed_message', topic=f"'{topic}'", error=error)
+                self._log.warning(topic, finding.text())
                 return
             if self._sent is not None and not is_static:
                 for each in transforms:

@@ -22,6 +22,7 @@ from slam_observer_ros.runs.health import (
     of_estimate,
     of_left_out,
     of_rejections,
+    of_stamps,
     of_velocity,
 )
 
@@ -62,6 +63,8 @@ class DiagnosticsPublisher:
         self._since_s: dict[str, float] = {}  # when what is wrong was found first
         self._last_received = {source.topic: 0 for source in inputs}
         self._last_dropped: Counter[str] = Counter()
+        self._last_malformed: Counter[str] = Counter()
+        self._last_unstamped: Counter[str] = Counter()
         self._last_counts: Counter[str] = Counter()
         self._recent_counts: deque[Counter[str]] = deque(maxlen=RECENT)
 
@@ -149,6 +152,7 @@ class DiagnosticsPublisher:
             count = f'{dropped.total()} message{"s" * (dropped.total() != 1)}'
             reasons = f'mostly {reason}' if others else reason
             findings.append(found('dropped_messages', count=count, reasons=reasons))
+        findings += self._of_messages()
         findings += self._of_empty_messages()
         findings += of_left_out(new, Level.WARNING)
         self._recent_counts.append(new)
@@ -160,9 +164,9 @@ class DiagnosticsPublisher:
             findings.append(found('unknown_pose'))
             # Landmarks that came without an id have one that was given here.
             estimator = self._estimator
+            problem = estimator.localisation_problem
             if is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses):
-                problem = estimator.localisation_problem
-                findings.append(found('ambiguous_pose', problem=problem))
+                findings += [problem] if problem else []
         return findings
 
     def _faults(self) -> list[str]:
@@ -183,6 +187,17 @@ class DiagnosticsPublisher:
         if self._last_counts[kind]:
             return []
         return [found('unused_input', count=source.received, topic=source.topic)]
+
+    def _of_messages(self) -> list[Finding]:
+        """Report inputs whose messages can't be read, have no stamp, or say what can't be."""
+        malformed = Counter({source.topic: source.malformed for source in self._inputs})
+        unreadable, unstamped = malformed - self._last_malformed, self._feed.unstamped
+        said = [source.last_malformed for source in self._inputs if unreadable[source.topic]]
+        said += [source.doubt for source in self._inputs]
+        findings = [finding for finding in said if finding is not None]
+        findings += of_stamps(unstamped - self._last_unstamped)
+        self._last_malformed, self._last_unstamped = malformed, unstamped.copy()
+        return findings
 
     def _of_empty_messages(self) -> list[Finding]:
         """Report, and log once, that a detector has not seen anything so far."""
