@@ -8,6 +8,7 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
@@ -26,7 +27,9 @@ class BaselineNoise:
 
     def __init__(self, settings: Settings) -> None:
         self._noise, self._settings = ObservationNoise(settings), settings
-        self._calibration = Calibration(without_calibration(settings), SPATIAL)
+        self._calibration = Calibration(
+            FilterArrays(np.eye(4)), without_calibration(settings), SPATIAL
+        )
         self._last_seen_ns: dict[int, int] = {}
 
     def corrected(self, event: ObservationEvent) -> ObservationEvent:

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import ObservationEvent, queued, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
@@ -34,7 +34,7 @@ class Odometry:
 
     def add(self, event: VelocityEvent) -> None:
         """Take in a velocity; stamps must not decrease."""
-        self._velocities.append(queued(event))
+        self._velocities.append(event)
         if self._stamp_ns is None:
             self._stamp_ns = event.stamp_ns
 

@@ -13,7 +13,7 @@ from types import FrameType
 import worlds
 
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PACKAGE = worlds.CHECKOUT / 'slam_observer_ros'
@@ -23,7 +23,7 @@ TRACED_AFTER = 200
 
 @dataclass(frozen=True, slots=True)
 class TracedStep:
-    """What runs while the estimator uses one observation with ids, Riccati gains.
+    """What runs while the estimator uses one event, with Riccati gains.
 
     Attributes
     ----------
@@ -54,6 +54,7 @@ def main() -> None:
         'traced step, functions called': step.functions,
         'traced step, changes of module': step.changes,
         'traced step, depth': step.depth,
+        'traced velocity, functions called': traced_velocity().functions,
         'lines': lines,
         'share of docstrings': f'{docstrings / lines:.1%}',
     }
@@ -126,15 +127,23 @@ def docstring_lines() -> tuple[int, int]:
 
 
 def traced_step(settings: Settings | None = None) -> TracedStep:
-    """Return what one step takes in the midst of the simulated wheeled loop."""
+    """Return what an observation with ids takes in the midst of the simulated wheeled loop."""
+    return _traced_kind(ObservationEvent, settings)
+
+
+def traced_velocity() -> TracedStep:
+    """Return what a velocity takes there."""
+    return _traced_kind(VelocityEvent)
+
+
+def _traced_kind(kind: type[Event], settings: Settings | None = None) -> TracedStep:
     world = worlds.load('simulated loop, wheeled')
     estimator = Estimator(replace(settings or world.settings, gains='riccati'))
     observed = 0
     for event in world.events:
-        is_observation = isinstance(event, ObservationEvent)
-        if is_observation and observed == TRACED_AFTER:
+        if isinstance(event, kind) and observed >= TRACED_AFTER:
             return _traced(estimator, event)
-        observed += is_observation
+        observed += isinstance(event, ObservationEvent)
         estimator.add(event)
     raise ValueError('the world has too few observations')
 

@@ -17,7 +17,7 @@ import numpy as np
 from odometry import Event
 from worlds import drive, Loop, simulated_settings, World
 
-from slam_observer_ros.common.computing import use_one_thread
+from slam_observer_ros.common.process import use_one_thread
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import ConfigurationError

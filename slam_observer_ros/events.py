@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
@@ -51,6 +51,7 @@ class VelocityEvent:
 
     """
 
+    kind: ClassVar = 'velocity'
     stamp_ns: int
     body_velocity: FloatArray  # (6,)
     covariance: FloatArray | None = None  # (6, 6)
@@ -76,11 +77,9 @@ class VelocityEvent:
 
 @dataclass(slots=True, eq=False)  # not frozen, which would take a microsecond more
 class VelocityBlock:
-    """k velocity events that came one after the other, as arrays; a single one is a block of one.
+    """k velocity events that came one after the other, as arrays; ``is_mean`` is that of all."""
 
-    ``is_mean`` is that of all of them.
-    """
-
+    kind: ClassVar = VelocityEvent.kind
     stamps_ns: IntArray  # (k,)
     body_velocities: FloatArray  # (k, 6)
     covariances: FloatArray | None = None  # (k, 6, 6), all of them stated
@@ -107,10 +106,6 @@ class VelocityBlock:
             self.is_mean,
         )
 
-    def one_by_one(self) -> list[VelocityBlock]:
-        """Return them as blocks of one."""
-        return [self.part(slice(row, row + 1)) for row in range(len(self))]
-
     def events(self) -> Iterator[VelocityEvent]:
         """Yield them as events."""
         received = [None] * len(self) if self.receive_ns is None else self.receive_ns.tolist()
@@ -129,6 +124,7 @@ class AngularVelocityEvent:
     no :class:`VelocityEvent` is in force it says nothing.
     """
 
+    kind: ClassVar = 'angular velocity'
     stamp_ns: int
     angular_velocity: FloatArray  # (3,)
     covariance: FloatArray | None = None  # (3, 3)
@@ -149,6 +145,7 @@ class AngularVelocityEvent:
 class ObservationEvent:
     """Landmarks seen at one instant."""
 
+    kind: ClassVar = 'observation'
     stamp_ns: int
     ids: IntArray  # (m,) UNKNOWN_ID where the sensor gives none
     points: FloatArray  # (m, 3)
@@ -215,23 +212,11 @@ Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
 """Anything that :meth:`slam_observer_ros.estimator.estimator.Estimator.add` takes."""
 
 
-Queued: TypeAlias = VelocityBlock | AngularVelocityEvent | ObservationEvent
-"""What is put in order of stamps, and then used: velocities together."""
+MeasuredVelocity: TypeAlias = VelocityEvent | VelocityBlock | AngularVelocityEvent
+"""What leads on: one velocity, or several that follow each other."""
 
-
-def queued(event: Event) -> Queued:
-    """Return an event as what is put in order; a velocity is a block of one."""
-    if not isinstance(event, VelocityEvent):
-        return event
-    covariance, receive_ns = event.covariance, event.receive_ns
-    return VelocityBlock(
-        np.array([event.stamp_ns], dtype=np.int64),
-        event.body_velocity[None],
-        None if covariance is None else covariance[None],
-        None if receive_ns is None else np.array([receive_ns], dtype=np.int64),
-        event.sensor_frame,
-        event.is_mean,
-    )
+Queued: TypeAlias = MeasuredVelocity | ObservationEvent
+"""What is put in order of stamps, and then used."""
 
 
 def is_automatic(ids: IntArray) -> BoolArray:

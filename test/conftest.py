@@ -18,7 +18,7 @@ from command_line import CommandLine
 from hypothesis import settings
 import pytest
 
-from slam_observer_ros.common.computing import use_one_thread
+from slam_observer_ros.common.process import use_one_thread
 from slam_observer_ros.estimator import estimator  # noqa: F401  # loads what computes in threads
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.runs.likelihood import Likelihood
-from slam_observer_ros.sensor_models.calibration import NAMES
+from slam_observer_ros.runs.accuracy import Likelihood
+from slam_observer_ros.sensor_models.calibration import OF_VELOCITY
 from slam_observer_ros.sensor_models.sensing import cosines, LEAST_COSINE
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.settings.parameter_table import Value
@@ -203,7 +203,7 @@ class Finder:
         widths = np.array([*stated.angular_scale_stddev, *stated.linear_scale_stddev])
         hidden = (share < MOSTLY_NOISE) & (widths == 0.0)
         possible = np.arange(6)[axes_of(stated.two_d_mode).pose]
-        names = {NAMES[i] for i in possible if hidden[i]}
+        names = {OF_VELOCITY[i].name for i in possible if hidden[i]}
         return sorted(name for name in names if f'{name[:-2]}_stddev' not in self._kept)
 
     def _run(self, settings: Settings) -> tuple[Estimator, Likelihood]:
@@ -268,7 +268,8 @@ class Finder:
             return delay
         if '_scale_' not in part.name:
             return part
-        noise = part.value * self._motion.noise_share[NAMES.index(part.name)]
+        names = [entry.name for entry in OF_VELOCITY]
+        noise = part.value * self._motion.noise_share[names.index(part.name)]
         return replace(part, deviation=min(math.hypot(part.deviation, noise), part.stated))
 
 

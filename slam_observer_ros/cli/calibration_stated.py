@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from slam_observer_ros.cli.noise_tuning import certainty, NoiseKind, of_motion, rounded, scaled
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, MotionFactor
+from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.sensor_models.calibration import Entry, OF_SENSOR, OF_VELOCITY
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings, Pose6
 
@@ -78,14 +79,19 @@ def trades(parts: list[CalibrationEstimate], correlations: FloatArray) -> list[T
     return sorted(found, key=lambda trade: -abs(trade.correlation))
 
 
-def _kind(name: str) -> str:
+def _entry_of(name: str) -> Entry:
     name = name.partition('/')[0]
-    return name if name in _WORDS else name.rpartition('_')[0]
+    return next(entry for entry in (*OF_VELOCITY, *OF_SENSOR) if entry.name == name)
+
+
+def _kind(name: str) -> str:
+    return _entry_of(name).parameter
 
 
 def _words(name: str) -> str:
-    kind, axis = _kind(name), name.partition('/')[0][-1]
-    return _WORDS[kind] if name.partition('/')[0] in _WORDS else f'{_WORDS[kind]} {axis}'
+    kind, axis = (entry := _entry_of(name)).parameter, entry.axis
+    words = _WORDS.get(kind, kind.replace('_', ' '))
+    return words if axis is None else f'{words} {"xyz"[axis]}'
 
 
 def _advice(one: str, other: str) -> str:
@@ -165,7 +171,7 @@ def state_found(
         name = part.name.partition('/')[0]
         if not is_seen(part) or (name.startswith(('sensor_', 'range_')) and not is_one):
             continue
-        parameter, index = _entry_of(name)
+        parameter, index = (entry := _entry_of(name)).parameter, entry.axis
         if parameter not in MOUNT:
             _put(values, settings, parameter, index, _as_known(part.value, part.deviation))
         elif sensor_pose is None:
@@ -230,14 +236,6 @@ def depth_text(found: Found) -> str:
     gain, deviation = found.depth_gain
     kept = '' if found.range_is_depth == (gain > 0.0) else ', which is not sure, or was not asked'
     return f'{what}: the log likelihood of depth is {gain:+.0f} ± {deviation:.0f} over range{kept}'
-
-
-def _entry_of(name: str) -> tuple[str, int | None]:
-    """Return the parameter that states a value, and its entry; None if it has one alone."""
-    if name in (DELAY_NAME, 'range_scale'):
-        return name, None
-    parameter, _, axis = name.rpartition('_')
-    return parameter, 'xyz'.index(axis)
 
 
 def _put(

@@ -26,11 +26,10 @@ from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.estimator.placement import Placement
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
 from slam_observer_ros.events import (
-    AngularVelocityEvent,
     Event,
+    MeasuredVelocity,
     ObservationEvent,
     Queued,
-    queued,
     UNKNOWN_ID,
     VelocityBlock,
 )
@@ -196,7 +195,7 @@ class Estimator(Estimate):
         """
         try:
             check_event(event, self.settings)
-            self._take(queued(event))
+            self._take(event)
         except InvalidEventError as error:
             self._drop(error)
             return False
@@ -239,7 +238,7 @@ class Estimator(Estimate):
         """
         end_s = time.monotonic() + limit_s
         for ready in self._queue.pop_believed():
-            events = ready.one_by_one() if isinstance(ready, VelocityBlock) else (ready,)
+            events = ready.events() if isinstance(ready, VelocityBlock) else (ready,)
             for event in events:
                 if time.monotonic() > end_s:
                     self._drop(InvalidEventError('stopped', 'held back when the end came'))
@@ -268,24 +267,19 @@ class Estimator(Estimate):
 
     def _process(self, item: Queued) -> None:
         """Use what has its turn: what is of one stamp, or velocities that follow each other."""
-        if isinstance(item, VelocityBlock):
-            for part in self._timeline.parts(item):
-                self._report_before(part.stamp_ns)
-                self._process_velocities(part, len(part))
-                if self._on_stamps is not None and len(part) > 1:
-                    self._on_stamps(part.stamps_ns[:-1])
-                self._timeline.advance_after_many()
-            return
-        self._report_before(item.stamp_ns)
         if isinstance(item, ObservationEvent):
+            if self._on_stamps is not None:
+                self._report_before(item.stamp_ns)
             self._process_observation(item)
+        elif isinstance(item, VelocityBlock):
+            for part in self._timeline.parts(item):
+                self._process_velocity(part)
         else:
-            self._process_velocities(item, 1)
-            self._timeline.advance_after_many()
+            self._process_velocity(item)
 
     def _report_before(self, stamp_ns: int) -> None:
         """Report the present stamp if the next event is of a later one."""
-        if self._on_stamps is not None and stamp_ns > (self.stamp_ns or 0):
+        if stamp_ns > (self.stamp_ns or 0):
             self._report_stamp()
 
     def _report_stamp(self) -> None:
@@ -293,10 +287,11 @@ class Estimator(Estimate):
         if self._on_stamps is not None and self.stamp_ns is not None:
             self._on_stamps(np.array([self.stamp_ns]))
 
-    def _process_velocities(
-        self, measured: VelocityBlock | AngularVelocityEvent, count: int
-    ) -> None:
-        is_late = self._timeline.is_late(measured)
+    def _process_velocity(self, measured: MeasuredVelocity) -> None:
+        """Use one velocity, or several that follow each other."""
+        count = len(measured) if isinstance(measured, VelocityBlock) else 1
+        if self._on_stamps is not None:
+            self._report_before(measured.stamp_ns)
         try:
             is_used = self._timeline.append(measured)
         except InvalidEventError as error:
@@ -304,9 +299,12 @@ class Estimator(Estimate):
             return
         if is_used:
             self._counts['velocity'] += count
-        if is_late:
+        if self._timeline.was_late:
             self._counts['late_velocity'] += 1
             self._warnings.warn('late_velocity')
+        if self._on_stamps is not None and isinstance(measured, VelocityBlock) and count > 1:
+            self._on_stamps(measured.stamps_ns[:-1])
+        self._timeline.advance_after_many()
 
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings

@@ -12,7 +12,12 @@ import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
-from slam_observer_ros.events import AngularVelocityEvent, Queued, VelocityBlock
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    ObservationEvent,
+    Queued,
+    VelocityBlock,
+)
 
 Key: TypeAlias = tuple[int, bool, bytes]
 
@@ -80,7 +85,7 @@ class EventQueue:
         self._reception = _Reception()
         self._strays = StrayStamps()
         # Newest stamp of each kind of event that was not ahead of all others.
-        self._newest_of_kind_ns: dict[type, int] = {}
+        self._newest_of_kind_ns: dict[str, int] = {}
         # The newest stamp that is taken, believed or not.
         self._lead_ns = 0
         self.newest_ns: int | None = None  # newest stamp that is believed
@@ -119,7 +124,7 @@ class EventQueue:
         newest of all, where none has been late.
         """
         newest_ns = self.newest_ns
-        if newest_ns is None or self._window.length_ns or not self._events.are_none:
+        if newest_ns is None or self._window.length_ns or self._events.held:
             return False
         if not 0 < event.stamp_ns - newest_ns <= self._usual_ns:
             return False
@@ -157,7 +162,8 @@ class EventQueue:
         stamp_ns, before_ns = event.stamp_ns, newest_ns
         if isinstance(event, VelocityBlock) and len(event) > 1:
             before_ns, stamp_ns = event.stamps_ns[-2:].tolist()
-        self._reception.note(event)
+        if event.receive_ns is not None:
+            self._reception.note(event)
         self._window.note(stamp_ns, before_ns)
         self._is_newest_of_kind(event, stamp_ns)
         if self._strays.last_ns is not None:
@@ -188,11 +194,10 @@ class EventQueue:
 
     def _is_newest_of_kind(self, event: Queued, stamp_ns: int) -> bool:
         """Note the stamp if it is the newest of its kind; if not, that kind has gone back."""
-        kind = type(event)
-        newest_ns = self._newest_of_kind_ns.get(kind)
+        newest_ns = self._newest_of_kind_ns.get(event.kind)
         if newest_ns is not None and stamp_ns <= newest_ns:
             return False
-        self._newest_of_kind_ns[kind] = stamp_ns
+        self._newest_of_kind_ns[event.kind] = stamp_ns
         return True
 
     def _is_held_up(self, event: Queued) -> bool:
@@ -222,25 +227,27 @@ class _Window:
         """Take the stamp of an event, and the newest one of those before it, nanoseconds."""
         if self._begin_ns is None:
             self._begin_ns = newest_ns
+        late = self._late
+        if stamp_ns < newest_ns:
+            late_ns = newest_ns - stamp_ns
+            while late and late[-1][1] <= late_ns:
+                late.pop()
+            late.append((newest_ns, late_ns))
+        elif not (late or self.length_ns):
+            return  # as nearly always
         oldest_ns = newest_ns - LATENESS_NS
-        late, late_ns = self._late, newest_ns - stamp_ns if stamp_ns < newest_ns else 0
-        if not (late_ns or self.length_ns) and len(late) == 1 and not late[0][1]:
-            late[0] = newest_ns, 0  # as nearly always: it is the latest that none was late
-            return
-        while late and late[-1][1] <= late_ns:
-            late.pop()
-        late.append((newest_ns, late_ns))
-        while late[0][0] < oldest_ns:
+        while late and late[0][0] < oldest_ns:
             late.popleft()
         if self._begin_ns <= oldest_ns:
-            self.length_ns = min(LATENESS_MARGIN * late[0][1], self._longest_ns)
+            latest_ns = late[0][1] if late else 0
+            self.length_ns = min(LATENESS_MARGIN * latest_ns, self._longest_ns)
 
 
 class _SortedEvents:
     """Events in stamp order, each of them once."""
 
     def __init__(self) -> None:
-        self._heap: list[tuple[Key, Queued]] = []  # by the first key of each
+        self.held: list[tuple[Key, Queued]] = []  # a heap, by the first key of each
         self.known: set[Key] = set()
         self._most_known = MIN_KNOWN
 
@@ -249,29 +256,25 @@ class _SortedEvents:
         keys = _keys(event)
         if not self.note(keys, oldest_ns):
             raise InvalidEventError('duplicate', 'this event is already known')
-        heapq.heappush(self._heap, (keys[0], event))
+        heapq.heappush(self.held, (keys[0], event))
 
     def note(self, keys: list[Key], oldest_ns: int) -> bool:
         """Note events, that are used at once, as known; return whether none of them was."""
-        if not self.known.isdisjoint(keys):
+        known = self.known
+        if not known.isdisjoint(keys):
             return False
-        self.known.update(keys)
-        if len(self.known) > self._most_known:
+        known.update(keys)
+        if len(known) > self._most_known:
             # After twice as many as were kept: O(1) for each event.
             self.known = {key for key in self.known if key[0] >= oldest_ns}
             self._most_known = max(2 * len(self.known), MIN_KNOWN)
         return True
 
-    @property
-    def are_none(self) -> bool:
-        """Whether no event is held back."""
-        return not self._heap
-
     def pop_until(self, stamp_ns: int) -> list[Queued]:
         ready: list[Queued] = []
-        while self._heap and self._heap[0][0][0] <= stamp_ns:
-            _, event = heapq.heappop(self._heap)
-            if isinstance(event, VelocityBlock) and len(event) > 1:
+        while self.held and self.held[0][0][0] <= stamp_ns:
+            _, event = heapq.heappop(self.held)
+            if isinstance(event, VelocityBlock):
                 event = self._cut(event, stamp_ns)
             ready.append(event)
         return ready
@@ -279,13 +282,13 @@ class _SortedEvents:
     def _cut(self, velocities: VelocityBlock, stamp_ns: int) -> VelocityBlock:
         """Return what comes until a stamp, and before what is next; the others are held back."""
         end: Key = (stamp_ns, True, b'')
-        if self._heap:
-            end = min(end, self._heap[0][0])
+        if self.held:
+            end = min(end, self.held[0][0])
         has_those_at_end = (end[0], False, _LINEAR) < end
         count = velocities.stamps_ns.searchsorted(end[0], 'right' if has_those_at_end else 'left')
         if count < len(velocities):
             rest = velocities.part(slice(count, None))
-            heapq.heappush(self._heap, ((rest.stamp_ns, False, _LINEAR), rest))
+            heapq.heappush(self.held, ((rest.stamp_ns, False, _LINEAR), rest))
         return velocities.part(slice(count))
 
     def pop_all(self) -> list[Queued]:
@@ -334,11 +337,12 @@ def _keys(event: Queued) -> list[Key]:
     """Return what no other event has; of several velocities what each has, in order."""
     if isinstance(event, VelocityBlock):
         return list(zip(event.stamps_ns.tolist(), repeat(False), repeat(_LINEAR)))
-    if isinstance(event, AngularVelocityEvent):
-        return [(event.stamp_ns, False, _ANGULAR)]
-    # Keys outlive their events, which may be clouds of many points.
-    content = event.ids.tobytes() + event.points.tobytes()
-    return [(event.stamp_ns, True, blake2b(content, digest_size=16).digest())]
+    if isinstance(event, ObservationEvent):
+        # Keys outlive their events, which may be clouds of many points.
+        content = event.ids.tobytes() + event.points.tobytes()
+        return [(event.stamp_ns, True, blake2b(content, digest_size=16).digest())]
+    of_kind = _ANGULAR if isinstance(event, AngularVelocityEvent) else _LINEAR
+    return [(event.stamp_ns, False, of_kind)]
 
 
 def _refusal(ahead_ns: int) -> InvalidEventError:

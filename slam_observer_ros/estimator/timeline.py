@@ -6,12 +6,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
-import numpy as np
-
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityBlock
+from slam_observer_ros.events import MeasuredVelocity, ObservationEvent, VelocityBlock
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
@@ -58,57 +56,52 @@ class Timeline:
         self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
         self._pending = 0
+        # Whether what was in force at the last event's stamp could not be changed any more.
         self.was_late = False
         self._in_force_ns = 0  # no velocity of before can change what is in force
-        self._newest_ns: dict[type, int] = {}
+        self._newest_ns: dict[str, int] = {}
 
-    def is_late(self, measured: VelocityBlock | AngularVelocityEvent) -> bool:
-        """Return whether what was in force at its stamp can't be changed any more."""
-        return measured.stamp_ns < self._in_force_ns
-
-    def parts(self, velocities: VelocityBlock) -> Iterator[VelocityBlock]:
+    def parts(self, velocities: VelocityBlock) -> Iterator[MeasuredVelocity]:
         """Yield velocities as :meth:`append` takes them, each time those that are next."""
-        if len(velocities) > 1 and velocities.stamp_ns <= max(
-            self.stamp_ns or -1, self._in_force_ns - 1
-        ):
-            yield from velocities.one_by_one()
+        if velocities.stamp_ns <= max(self.stamp_ns or -1, self._in_force_ns - 1):
+            yield from velocities.events()
             return
         while len(velocities) > (room := MAX_PENDING_VELOCITIES - self._pending):
             yield velocities.part(slice(room))
             velocities = velocities.part(slice(room, None))
         yield velocities
 
-    def _note_stamp(self, stamp_ns: int) -> int:
-        """Note the stamp of an event that is about to be used; return ``state_ns``."""
-        if self.stamp_ns is None or stamp_ns > self.stamp_ns:
-            self.stamp_ns = stamp_ns
+    def _note_stamps(self, first_ns: int, last_ns: int) -> int:
+        """Note the stamps of what is about to be used; return ``state_ns``."""
+        if self.stamp_ns is None or last_ns > self.stamp_ns:
+            self.stamp_ns = last_ns
         if self.state_ns is None:
-            self.state_ns = stamp_ns
+            self.state_ns = first_ns
         return self.state_ns
 
-    def append(self, measured: VelocityBlock | AngularVelocityEvent) -> bool:
+    def append(self, measured: MeasuredVelocity) -> bool:
         """Add velocities; return whether they are in force: an angular one waits for a linear one.
 
-        A late one, which is alone, leads on from where velocities can still be changed. Raise
+        A late one, which is no block, leads on from where velocities can still be changed. Raise
         :exc:`InvalidEventError` if a newer one of its kind was used before it (``'too_late'``).
         """
         # Each kind in stamp order, and none before what is already in force.
-        kind, first_ns, count = type(measured), measured.stamp_ns, 1
-        last_ns = first_ns
+        first_ns = last_ns = measured.stamp_ns
+        count = 1
         if isinstance(measured, VelocityBlock):
             last_ns, count = int(measured.stamps_ns[-1]), len(measured)
-        if first_ns < self._newest_ns.get(kind, 0):
+        self.was_late = first_ns < self._in_force_ns
+        if first_ns < self._newest_ns.get(measured.kind, 0):
             raise InvalidEventError('too_late', 'a newer velocity was already used')
-        self._newest_ns[kind] = last_ns
-        if first_ns < self._in_force_ns:
+        self._newest_ns[measured.kind] = last_ns
+        if self.was_late and not isinstance(measured, VelocityBlock):
             first_ns = last_ns = self._in_force_ns
-            measured = _at(measured, first_ns)
+            measured = replace(measured, stamp_ns=first_ns)
         if not self.velocities.append(measured):
             return False
         # In force from now on; the state follows at the next observation, or after many.
         self._in_force_ns = last_ns
-        self._note_stamp(first_ns)
-        self._note_stamp(last_ns)
+        self._note_stamps(first_ns, last_ns)
         self._pending += count
         return True
 
@@ -156,7 +149,7 @@ class Timeline:
 
         One without points, as an idle sensor sends, moves nothing: it would make others late.
         """
-        state_ns = self._note_stamp(event.stamp_ns)
+        state_ns = self._note_stamps(event.stamp_ns, event.stamp_ns)
         self.was_late = bool(len(event.ids)) and event.stamp_ns < self._in_force_ns
         if not len(event.ids):
             return replace(event, stamp_ns=state_ns)
@@ -189,12 +182,3 @@ class Timeline:
             return se3.inverse(self.motion(end_ns, start_ns))
         calibration = self._hypotheses.best.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
-
-
-def _at(
-    measured: VelocityBlock | AngularVelocityEvent, stamp_ns: int
-) -> VelocityBlock | AngularVelocityEvent:
-    """Return a single velocity with another stamp."""
-    if isinstance(measured, VelocityBlock):
-        return replace(measured, stamps_ns=np.array([stamp_ns]))
-    return replace(measured, stamp_ns=stamp_ns)

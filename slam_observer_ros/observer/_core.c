@@ -29,6 +29,7 @@ static const double SUSPICION = 3.0;         /* robust.py */
 static const double LOG_ROOT_2_PI = 0.9189385332046728;
 static const int REWEIGHTINGS = 2;
 static const i64 LATEST_NS = (i64)1 << 61;   /* stamps beyond it are unusual: no sum overflows */
+static const i64 DELAY = 42; /* which entry of a calibration it is, behind those of [M b] */
 static const long MAX_ROOM = 1 << 15;        /* rows of P: no product of sizes overflows */
 
 static double seconds(i64 later_ns, i64 since_ns) { return (double)(later_ns - since_ns) / 1e9; }
@@ -112,7 +113,7 @@ typedef struct {
     const double *A, *y_ref;
     double *a, *P;
     i64 N, first, is_planar;
-    const double *calibration;
+    const double *rates;
     const i64 *estimated;
     const double *drift;
     long n, room, c, c_v;
@@ -120,7 +121,7 @@ typedef struct {
 } Estimate;
 
 static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
-    static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "b", "dT", "lv",
+    static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "b", "d67", "lv",
                                         "dcc", NULL};
     if (!read_fields(door, tuple, specs, x, "Estimate"))
         return 0;
@@ -133,7 +134,7 @@ static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
     door->sizes['p'] = x->p;
     if (x->room > MAX_ROOM || x->n > MAX_ROOM || x->c > MAX_ROOM || x->c_v > x->c
         || x->first < x->p + x->c || x->first > x->room || x->N != x->first + x->k * x->n
-        || x->N > x->room || !are_within(x->estimated, x->c_v, 12))
+        || x->N > x->room || !are_within(x->estimated, x->c_v, DELAY))
         return refuse("Estimate");
     door->sizes['f'] = (Py_ssize_t)x->first;
     return 1;
@@ -276,10 +277,15 @@ static int moves(const double V[6]) {
     return 0;
 }
 
-static void calibrated(const Estimate *x, const double V[6], double out[6]) { /* (1 + s) V + b */
+static void calibrated(const Estimate *x, const double V[6], double out[6]) { /* M V + b */
     int is_moving = moves(V);
-    for (int j = 0; j < 6; j++)
-        out[j] = V[j] * x->calibration[j] + (is_moving ? x->calibration[6 + j] : 0.0);
+    for (int i = 0; i < 6; i++) {
+        const double *row = x->rates + 7 * i;
+        out[i] = 0.0;
+        for (int j = 0; j < 6; j++)
+            out[i] += row[j] * V[j];
+        out[i] += is_moving ? row[6] : 0.0;
+    }
 }
 
 /* Fill in pieces [first, last); 0 for gaps. */
@@ -443,17 +449,17 @@ static void add_at_pose(const Estimate *x, const double Ad[36], const Piece *bef
     if (stated_of(before) || stated_of(after))
         add_stated(p, Ad, stated_of(before), stated_of(after), out);
     for (long j = 0; j < x->c_v; j++) {
-        int column = (int)x->estimated[j] % 6, is_bias = x->estimated[j] >= 6;
+        int row = (int)x->estimated[j] / 7, column = (int)x->estimated[j] % 7;
         double share = 0.0;
-        if (x->estimated[j] == 12)
+        if (x->estimated[j] == DELAY)
             continue;
         for (int part = 0; part < 2; part++) {
             const Piece *piece = part ? after : before;
             if (piece)
-                share += 0.5 * piece->dt_s * (is_bias ? piece->moves : piece->V[column]);
+                share += 0.5 * piece->dt_s * (column == 6 ? piece->moves : piece->V[column]);
         }
         for (int s = 0; s < p; s++)
-            out->F[s * x->c + j] += Ad[6 * s + column] * share;
+            out->F[s * x->c + j] += Ad[6 * s + row] * share;
     }
 }
 

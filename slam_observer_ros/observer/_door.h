@@ -27,7 +27,6 @@ static inline void open_door(Door *door) {
     door->count = 0;
     for (int letter = 0; letter < SIZES; letter++)
         door->sizes[letter] = letter >= '0' && letter <= '9' ? letter - '0' : UNBOUND;
-    door->sizes['T'] = 13;
 }
 
 static inline void close_door(Door *door) {

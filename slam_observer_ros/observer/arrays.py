@@ -28,6 +28,8 @@ class FilterArrays(LandmarkColumns):
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
     each (n, 3), metres and m/s, the ``orientations`` of tags, and ``covariance``, P (N, N), empty
     for gains that know none.
+    ``calibration`` (43 + 7 s,) has the values of velocities and of s sensors
+    (:mod:`.sensor_models.calibration`).
     ``have_moved`` says whether any landmark has had a velocity so far, ``is_exact`` that the map
     is, and no landmark is moved. ``postponed`` says what â_i have yet to follow, in large maps.
     """
@@ -42,6 +44,7 @@ class FilterArrays(LandmarkColumns):
         self.reference_pose: FloatArray = np.array(reference_pose)
         self.A: FloatArray = np.eye(4)
         self.covariance = SymmetricMatrix(np.zeros((0, 0)))
+        self.calibration: FloatArray = np.empty(0)
         self.orientations = LandmarkOrientations()
         self.have_moved = self.is_exact = False
         self.postponed: Postponed | None = None
@@ -55,6 +58,6 @@ class FilterArrays(LandmarkColumns):
         """Return an independent copy: one copy of memory an array."""
         other = super().copy()
         other.reference_pose, other.A = self.reference_pose.copy(), self.A.copy()
-        other.covariance = self.covariance.copy()
+        other.covariance, other.calibration = self.covariance.copy(), self.calibration.copy()
         other.orientations = self.orientations.copy()
         return other

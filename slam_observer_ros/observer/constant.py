@@ -23,6 +23,7 @@ from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
 from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.observer.gains import Gains, OF_JOINT_COVARIANCES
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.sensor_models.calibration import VELOCITY_STDDEVS
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
@@ -38,11 +39,7 @@ class ConstantGains(Gains):
     """
 
     ignores = (
-        'angular_scale_stddev',
-        'linear_scale_stddev',
-        'angular_bias_stddev',
-        'linear_bias_stddev',
-        'velocity_delay_stddev',
+        *VELOCITY_STDDEVS,
         *OF_JOINT_COVARIANCES,
         'calibration_drift',
         'landmark_velocity_stddev',

@@ -20,8 +20,8 @@ class Estimate(NamedTuple):
     size: int  # N
     first: int  # the first column of the landmarks; what is postponed is between p + c and it
     is_planar: bool  # whether p is 3 and k is 2, in place of 6 and 3
-    calibration: FloatArray  # (13,) 1 + s, b, and τ of velocities
-    estimated: IntArray  # (c_v,) which of these c̃ begins with; scales, biases, delay
+    rates: FloatArray  # (6, 7) [M b] of velocities M V + b
+    estimated: IntArray  # (c_v,) which of these, row by row, c̃ begins with; 42 is the delay, last
     drift: FloatArray  # (c, c) what a second adds to the covariance of c̃
 
 

@@ -23,7 +23,11 @@ from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
+from slam_observer_ros.sensor_models.calibration import (
+    Calibration,
+    SENSOR_STDDEVS,
+    without_calibration,
+)
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -37,9 +41,7 @@ OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 
 OF_JOINT_COVARIANCES = (
     'motion_noise_factor',
-    'sensor_rotation_stddev',
-    'sensor_translation_stddev',
-    'range_scale_stddev',
+    *SENSOR_STDDEVS,
 )
 """Settings of what only a joint covariance can estimate."""
 
@@ -127,7 +129,7 @@ class Gains(ABC):
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
         self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
-        self.calibration = Calibration(self.estimated(settings), self.axes)
+        self.calibration = Calibration(self.observer, self.estimated(settings), self.axes)
         self.motion_noise = MotionNoise(settings)
 
     @staticmethod
@@ -138,7 +140,8 @@ class Gains(ABC):
     def copy(self) -> Self:
         """Return an independent copy."""
         other = copy(self)
-        other.observer, other.calibration = self.observer.copy(), self.calibration.copy()
+        other.observer = self.observer.copy()
+        other.calibration = self.calibration.of(other.observer)
         other.motion_noise = self.motion_noise.copy()
         return other
 

@@ -44,6 +44,7 @@ from slam_observer_ros.observer.symmetric_matrix import (
     add_symmetric_product,
     subtract_square,
 )
+from slam_observer_ros.sensor_models.calibration import calibrated, with_moves
 from slam_observer_ros.sensor_models.motion_noise import (
     Factors,
     learnt,
@@ -89,8 +90,8 @@ def advance(
     rows, dt_s, before_s = pieces
     V = _counting(velocities.body_velocities[rows], x.is_planar)
     axes, (p, c) = axes_of(x.is_planar), out.sensitivity.shape
-    # (27)  Â ← Â exp(V dt), V = (1 + s) ∘ V_measured + b
-    path = se3.path(x.A, _calibrated(x, V) * dt_s[:, None])
+    # (27)  Â ← Â exp(V dt), V = M V_measured + b
+    path = se3.path(x.A, calibrated(x.rates, V) * dt_s[:, None])
     out.A[:] = path[-1]
     out.A[:3, :3] = so3.normalise(path[-1, :3, :3])
     # ε ← ε + F c̃ + w,  w ~ N(0, Σ Ad_Â Q Ad_Âᵀ)
@@ -145,11 +146,6 @@ def _counting(V: FloatArray, is_planar: bool) -> FloatArray:
     return V * _PLANAR if is_planar else V
 
 
-def _calibrated(x: Estimate, V: FloatArray) -> FloatArray:
-    """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so."""
-    return V * x.calibration[:6] + np.asarray(V.any(axis=-1))[..., None] * x.calibration[6:12]
-
-
 def _summed_noise(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
     """Write Σ Ad_Â Q Ad_Âᵀ by the trapezoidal rule, ``shares`` (k + 1, 6) of Q at the poses."""
     p = len(out.noise)
@@ -178,21 +174,20 @@ def _sensitivity(
     interval: Interval,
     out: Advanced,
 ) -> FloatArray:
-    """Write F (p, c): ε' = Ad_Â (V ∘ s̃ + b̃), and of a delay what its two ends differ by."""
+    """Write F (p, c): ε' = Ad_Â (M̃ V + b̃), and of a delay what its two ends differ by."""
     F = out.sensitivity
     F[:] = 0.0
-    of_rates = x.estimated[x.estimated < 12]
+    of_rates = x.estimated[x.estimated < x.rates.size]
     if len(of_rates):
-        columns, are_biases = of_rates % 6, of_rates >= 6
-        rates = np.where(are_biases, V.any(axis=1, keepdims=True), V[:, columns])
-        shares = se3.at_poses(rates * dt_s[:, None])
-        F[:, : len(columns)] = (Ad[:, :, columns] * shares[:, None, :]).sum(axis=0)
+        rows, columns = of_rates // 7, of_rates % 7
+        shares = se3.at_poses(with_moves(V)[:, columns] * dt_s[:, None])
+        F[:, : len(rows)] = (Ad[:, :, rows] * shares[:, None, :]).sum(axis=0)
     if interval.reach_ns:
         at_start = interval.at_start
         if at_start is None:
             at_start = _mean_about(interval.start_ns, velocities, interval, x.is_planar)
         out.at_end[:] = _mean_about(interval.end_ns, velocities, interval, x.is_planar)
-        before, after = _calibrated(x, at_start), _calibrated(x, out.at_end)
+        before, after = calibrated(x.rates, at_start), calibrated(x.rates, out.at_end)
         F[:, len(x.estimated) - 1] = Ad[0].dot(before) - Ad[-1].dot(after)
     return F
 

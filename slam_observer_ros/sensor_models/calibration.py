@@ -1,16 +1,19 @@
 """Calibration as part of the state: of the velocity, by axis, and of each sensor of landmarks.
 
-V_true(t) = (1 + s) ∘ V(t − τ) + b. The delay τ is how much later than its stamp a velocity shows
-in what is observed: a command takes a while to be obeyed, and an image a while to be stamped. A
-sensor's part, ψ, d and s of :mod:`slam_observer_ros.geometry.sensor_mounting`, begins with the
-first observation from its frame.
+V_true(t) = M V(t − τ) + b, where M has the scale factors 1 + s on its diagonal. The delay τ is how
+much later than its stamp a velocity shows in what is observed: a command takes a while to be
+obeyed, and an image a while to be stamped. A sensor's part, ψ, d and s of
+:mod:`slam_observer_ros.geometry.sensor_mounting`, begins with the first observation from its
+frame.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import replace
 import math
+from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -22,14 +25,14 @@ from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
-NAMES = (
-    *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
-    *(f'{part}_bias_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
-    DELAY_NAME,
-)
-"""Names of six scales, six biases and the delay τ."""
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
-DELAY = NAMES.index(DELAY_NAME)
+MOVES = 6
+"""Column of b in [M b] (6, 7), which is multiplied by 1 where a velocity is not zero."""
+
+DELAY, SENSORS, EACH = 42, 43, 7
+"""Where τ is behind [M b], row by row, and behind it ``EACH`` values of each sensor."""
 
 MIN_DELAY_S = -0.2
 """Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier.
@@ -37,180 +40,195 @@ How the robot moves so much later is not known yet when it is needed: without a 
 estimate, which can't make up for it, would stray ever further.
 """
 
-UNITS = ('',) * 6 + ('rad/s',) * 3 + ('m/s',) * 3 + ('s',)
 
-SENSOR_NAMES = (
-    *(f'sensor_rotation_{axis}' for axis in 'xyz'),
-    *(f'sensor_translation_{axis}' for axis in 'xyz'),
-    'range_scale',
+class Entry(NamedTuple):
+    """A value that may be calibrated. ``parameter`` states it, ``parameter``_stddev how sure."""
+
+    name: str
+    parameter: str
+    axis: int | None  # which of x, y and z of the parameter; None where that is one number
+    place: int  # in [M b] and τ (43,), or in the values (7,) of a sensor
+    unit: str
+
+
+def _entries(parameter: str, places: Iterable[int]) -> list[Entry]:
+    """Return what a parameter states of the values at ``places``: of one, or of x, y and z."""
+    field = Settings.__dataclass_fields__[f'{parameter}_stddev']
+    each = [('_x', 0), ('_y', 1), ('_z', 2)] if isinstance(field.default, tuple) else [('', None)]
+    return [
+        Entry(parameter + suffix, parameter, axis, place, field.metadata['unit'])
+        for (suffix, axis), place in zip(each, places, strict=True)
+    ]
+
+
+_PLACES = np.arange(DELAY).reshape(6, 7)  # of [M b]
+_SCALES, _BIASES = np.diagonal(_PLACES).tolist(), _PLACES[:, MOVES].tolist()
+OF_VELOCITY = (
+    *_entries('angular_scale', _SCALES[:3]),
+    *_entries('linear_scale', _SCALES[3:]),
+    *_entries('angular_bias', _BIASES[:3]),
+    *_entries('linear_bias', _BIASES[3:]),
+    *_entries(DELAY_NAME, [DELAY]),
 )
-"""Names of ψ, d and e^s."""
+"""All that may be calibrated of velocities: one more entry of M is one more row."""
 
-SENSOR_UNITS = ('rad',) * 3 + ('m',) * 3 + ('',)
+OF_SENSOR = (
+    *_entries('sensor_rotation', range(3)),
+    *_entries('sensor_translation', range(3, 6)),
+    *_entries('range_scale', [SCALE := 6]),
+)
+"""All that may be calibrated of a sensor: ψ, d and e^s."""
 
-SCALE = SENSOR_NAMES.index('range_scale')
+VELOCITY_STDDEVS, SENSOR_STDDEVS = (
+    tuple(dict.fromkeys(f'{entry.parameter}_stddev' for entry in entries))
+    for entries in (OF_VELOCITY, OF_SENSOR)
+)
+"""Parameters that say how far these may be off, 0 for not at all."""
 
 
-class SensorCalibration:
-    """ψ, d and s of the sensor of one frame, and which of these seven are ``estimated`` (c_s,).
+class CalibrationOwner(Protocol):
+    """What has the values (43 + 7 s,) of velocities, [M b] and τ, and of s sensors."""
 
-    ``number`` counts the sensors. At the start the ``values`` (7,) are as stated, and the
-    estimates have ``variances`` (c_s,).
-    """
-
-    def __init__(
-        self,
-        frame: str,
-        number: int,
-        stated: FloatArray,
-        estimated: IntArray,
-        variances: FloatArray,
-    ) -> None:
-        self.frame, self.number = frame, number
-        self.estimated, self.variances = estimated, variances
-        self._stated, self.values = stated, stated.copy()
-
-    def shift(self, change: FloatArray) -> None:
-        """Add ``change`` (c_s,) to the estimates."""
-        values: FloatArray = self.values.copy()
-        values[self.estimated] += change
-        self.values = values
-
-    def estimates(self, variances: FloatArray, stated: FloatArray) -> list[CalibrationEstimate]:
-        """Return the estimates with ``variances`` (c_s,), and standard deviations at the start."""
-        suffix = f'/{self.frame}' if self.frame else ''
-        found = []
-        for i, variance, error in zip(self.estimated, variances, stated, strict=True):
-            value, nominal, factor = self.values[i], self._stated[i], 1.0
-            if i == SCALE:  # s is its logarithm
-                value, nominal = math.exp(value), math.exp(nominal)
-                factor = value
-            found.append(
-                CalibrationEstimate(
-                    SENSOR_NAMES[i] + suffix,
-                    float(value),
-                    float(factor * np.sqrt(variance)),
-                    SENSOR_UNITS[i],
-                    nominal=float(nominal),
-                    stated=float(factor * error),
-                )
-            )
-        return found
+    calibration: FloatArray
 
 
 class Calibration:
-    """Estimates of those c entries whose uncertainty is not 0: of s, b and τ, then of sensors.
+    """What an ``owner``'s values do, and which c of them are estimated: s, b and τ, then sensors'.
 
-    ``initial_variances`` (c,) grow by ``drift_covariance`` (c, c) a second, if one ``drifts``;
-    ``delay_error_ns`` is the standard deviation of τ at the start, 0 where it is not estimated.
-    ``sensors`` are those seen so far, by their frames; ``corrects_points`` says whether what they
-    show is not taken as it comes.
+    These are the ones whose uncertainty is not 0. ``initial_variances`` (c,) grow by
+    ``drift_covariance`` (c, c) a second, if one ``drifts``; ``delay_error_ns`` is the standard
+    deviation of τ at the start, 0 where it is not estimated. ``sensors`` are the frames of those
+    seen so far, and ``of_sensor`` (c_s,) says which of the seven values of each are estimated;
+    ``corrects_points`` says whether what they show is not taken as it comes.
     """
 
-    def __init__(self, settings: Settings, axes: EstimatedAxes) -> None:
-        self.axes, self._settings = axes, settings
-        scale = np.array([*settings.angular_scale_stddev, *settings.linear_scale_stddev])
-        bias = np.array([*settings.angular_bias_stddev, *settings.linear_bias_stddev])
-        errors = np.concatenate([scale, bias, [settings.velocity_delay_stddev]])
-        pose = np.arange(6)[axes.pose]
-        possible = np.concatenate([pose, 6 + pose, [DELAY]])
-        self._estimated: IntArray = possible[errors[possible] > 0.0]
-        self._scales = int(np.sum(self._estimated < 6))
-        self._calibrated = self._estimated[self._estimated < DELAY] % 6
-        self._nominal = stated_of_velocity(settings)
-        self._all: FloatArray = self._nominal.copy()
-        self._values: FloatArray | None = None  # as asked for since the last change
-        # τ; where it is negative the latest velocity is held for longer.
-        self.delay_ns = to_ns(settings.velocity_delay)
-        self.sensors: dict[str, SensorCalibration] = {}
-        stated, deviations = _of_a_sensor(settings)
-        of_sensor = np.append(pose, SCALE)
-        self._of_sensor: IntArray = of_sensor[deviations[of_sensor] > 0.0]
-        self._stated, self._sensor_variances = stated, deviations[self._of_sensor] ** 2
-        self.corrects_points = bool(
-            settings.range_is_depth or stated.any() or len(self._of_sensor)
+    def __init__(self, owner: CalibrationOwner, settings: Settings, axes: EstimatedAxes) -> None:
+        self._owner, self.axes, self._settings = owner, axes, settings
+        errors, is_possible = _of_velocity(settings, '_stddev'), np.zeros((6, 7))
+        is_possible[axes.pose, axes.pose] = is_possible[axes.pose, MOVES] = 1.0
+        errors[:DELAY] *= is_possible.ravel()
+        self.velocity_places: IntArray = np.array(
+            [entry.place for entry in OF_VELOCITY if errors[entry.place] > 0.0], dtype=np.int64
         )
-        self.count = self.of_velocity = len(self._estimated)  # c, and how many are no sensor's
+        rates = self.velocity_places[self.velocity_places < DELAY]
+        self._rows, self._columns = rates // 7, rates % 7
+        stated, deviations = _of_a_sensor(settings)
+        of_sensor = np.append(np.arange(6)[axes.pose], SCALE)
+        self.of_sensor: IntArray = of_sensor[deviations[of_sensor] > 0.0]
+        self._stated, self._sensor_variances = stated, deviations[self.of_sensor] ** 2
+        self.sensors: tuple[str, ...] = ()
+        self.corrects_points = bool(settings.range_is_depth or stated.any() or len(self.of_sensor))
         self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
-        self._set_variances(errors[self._estimated] ** 2)
+        self.of_velocity = len(self.velocity_places)  # how many of the c are no sensor's
+        # (c,) which of the values these are, and all as they were at the start
+        self._places, self._nominal = self.velocity_places, stated_of_velocity(settings)
+        owner.calibration = self._nominal.copy()
+        self._set_variances(errors[self._places] ** 2)
 
-    def copy(self) -> Calibration:
-        """Return an independent copy."""
+    def of(self, owner: CalibrationOwner) -> Self:
+        """Return the same of a copy of the owner."""
         other = copy(self)
-        other._all = self._all.copy()
-        other.sensors = {frame: copy(sensor) for frame, sensor in self.sensors.items()}
+        other._owner = owner
         return other
 
     def _set_variances(self, variances: FloatArray) -> None:
-        self.initial_variances = variances
+        self.count, self.initial_variances = len(variances), variances
         self.drift_covariance = np.diag(variances * self._settings.calibration_drift**2)
         self.drifts = bool(self.drift_covariance.any())
 
-    def add_sensor(self, frame: str) -> SensorCalibration:
-        """Append what is estimated of the sensor of a new frame."""
-        number, variances = len(self.sensors), self._sensor_variances
-        sensor = SensorCalibration(frame, number, self._stated, self._of_sensor, variances)
-        self.sensors[frame], self._values = sensor, None
-        self.count += len(sensor.estimated)
-        self._set_variances(np.append(self.initial_variances, sensor.variances))
-        return sensor
+    def add_sensor(self, frame: str) -> FloatArray:
+        """Append what is estimated of the sensor of a new frame; return its variances (c_s,)."""
+        more, owner = len(self._nominal) + self.of_sensor, self._owner
+        self.sensors = (*self.sensors, frame)
+        self._places = np.append(self._places, more)
+        self._nominal = np.append(self._nominal, self._stated)
+        owner.calibration = np.append(owner.calibration, self._stated)
+        self._set_variances(np.append(self.initial_variances, self._sensor_variances))
+        variances: FloatArray = self._sensor_variances
+        return variances
 
     @property
     def values(self) -> FloatArray:
         """(c,) estimates: scale factors 1 + s, biases b, the delay τ in seconds; then sensors'."""
-        if self._values is None:
-            of_sensors = [part.values[part.estimated] for part in self.sensors.values()]
-            self._values = np.concatenate([self._all[self._estimated], *of_sensors])
-            self._values.setflags(write=False)
-        return self._values
+        values: FloatArray = self._owner.calibration.take(self._places)
+        return values
+
+    @property
+    def rates(self) -> FloatArray:
+        """(6, 7) [M b], as a view."""
+        rates: FloatArray = self._owner.calibration[:DELAY].reshape(6, 7)
+        return rates
+
+    @property
+    def delay_ns(self) -> int:
+        """The delay τ; where it is negative the latest velocity is held for longer."""
+        return to_ns(float(self._owner.calibration[DELAY]))
 
     @property
     def calibrates_sensors(self) -> bool:
         """Whether some of the c entries are those of sensors."""
         return self.count > self.of_velocity
 
-    def columns(self, sensor: SensorCalibration) -> slice:
+    def sensor(self, frame: str) -> FloatArray:
+        """Return ψ, d and s (7,) of a sensor, as a view."""
+        first = SENSORS + EACH * self.sensors.index(frame)
+        values: FloatArray = self._owner.calibration[first : first + EACH]
+        return values
+
+    def columns(self, frame: str) -> slice:
         """Return which of the c entries are those of a sensor."""
-        before = [other for other in self.sensors.values() if other.number < sensor.number]
-        first = self.of_velocity + sum(len(other.estimated) for other in before)
-        return slice(first, first + len(sensor.estimated))
+        each = len(self.of_sensor)
+        first = self.of_velocity + each * self.sensors.index(frame)
+        return slice(first, first + each)
 
     def sensor_columns(self) -> tuple[FloatArray, IntArray]:
         """Return ψ, d and s of all sensors (s, 7), and which of the c entries they are, or −1."""
-        columns = np.full((len(self.sensors), 7), -1)
-        for sensor in self.sensors.values():
-            entries = np.arange(self.count)[self.columns(sensor)]
-            columns[sensor.number, sensor.estimated] = entries
-        values = [sensor.values for sensor in self.sensors.values()]
-        return np.array(values).reshape(-1, 7), columns
+        values = self._owner.calibration[SENSORS:].reshape(-1, EACH)
+        columns = np.full(values.shape, -1)
+        columns[:, self.of_sensor] = np.arange(self.of_velocity, self.count).reshape(
+            len(values), -1
+        )
+        return values.copy(), columns
 
-    def estimates(self, variances: FloatArray) -> list[CalibrationEstimate]:
-        """Return the estimates with ``variances`` (c,), what the filter knows of them."""
+    def estimates(
+        self, variances: FloatArray, values: FloatArray | None = None
+    ) -> list[CalibrationEstimate]:
+        """Return the estimates with ``variances`` (c,), what the filter knows of them.
+
+        Or ``values`` (c,) in place of the present ones.
+        """
+        values = self.values if values is None else values
         stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
-        of_velocity = [
-            CalibrationEstimate(
-                NAMES[i],
-                float(self._all[i]),
-                float(np.sqrt(variance)),
-                UNITS[i],
-                nominal=float(self._nominal[i]),
-                stated=float(error),
+        each = zip(self._places.tolist(), values, variances, stated, strict=True)
+        return [self._estimate(*part) for part in each]
+
+    def _estimate(
+        self, place: int, value: float, variance: float, stated: float
+    ) -> CalibrationEstimate:
+        nominal, factor = self._nominal[place], 1.0
+        if place < SENSORS:
+            name, unit = next(
+                (entry.name, entry.unit) for entry in OF_VELOCITY if entry.place == place
             )
-            for i, variance, error in zip(self._estimated, variances, stated, strict=False)
-        ]
-        return of_velocity + [
-            estimate
-            for sensor in self.sensors.values()
-            for estimate in sensor.estimates(
-                variances[self.columns(sensor)], stated[self.columns(sensor)]
-            )
-        ]
+        else:
+            sensor, number = divmod(place - SENSORS, EACH)
+            entry, frame = OF_SENSOR[number], self.sensors[sensor]
+            name, unit = entry.name + f'/{frame}' * bool(frame), entry.unit
+            if number == SCALE:  # s is its logarithm
+                value, nominal = math.exp(value), math.exp(nominal)
+                factor = value
+        return CalibrationEstimate(
+            name,
+            float(value),
+            float(factor * np.sqrt(variance)),
+            unit,
+            nominal=float(nominal),
+            stated=float(factor * stated),
+        )
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (…, 6) as (1 + s) ∘ V + b; exact zeros stay so."""
-        # Wheels that stand turn no robot, however unlike, and no gyroscope gives zero on all axes.
-        biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
-        return body_velocities * self._all[:6] + biases
+        """Return velocities (…, 6) as M V + b; exact zeros stay so."""
+        return calibrated(self.rates, body_velocities)
 
     def apply_to_covariance(
         self, covariance: FloatArray, body_velocity: FloatArray, variances: FloatArray
@@ -219,13 +237,10 @@ class Calibration:
 
         ``variances`` (c,) are what the filter knows of the estimates.
         """
-        scales = self._all[:6]
-        applied = scales[:, None] * covariance * scales
-        if self.of_velocity:
-            of_all = np.zeros(len(NAMES))
-            of_all[self._estimated] = variances[: self.of_velocity]
-            of_velocity = of_all[:6] * body_velocity**2 + of_all[6:DELAY] * _moves(body_velocity)
-            applied.ravel()[::7] += of_velocity
+        M = self.rates[:, :MOVES]
+        applied: FloatArray = M @ covariance @ M.T
+        shares = variances[: len(self._rows)] * self._rates(body_velocity[None])[0] ** 2
+        applied.ravel()[::7] += np.bincount(self._rows, shares, minlength=6)
         return applied
 
     def sensitivity(
@@ -244,9 +259,9 @@ class Calibration:
         if not self.count:
             return np.empty((Ad.shape[1], 0))
         shares = se3.at_poses(self._rates(measured_velocities) * dt_s[:, None])
-        of_rates = Ad.take(self._calibrated, axis=2) * shares[:, None, :]
+        of_rates = Ad.take(self._rows, axis=2) * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
-        F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
+        F[:, : len(self._rows)] = of_rates.sum(axis=0)
         if self.delay_error_ns and at_ends is not None:
             first, last = self.apply(at_ends)
             F[:, self.of_velocity - 1] = Ad[0].dot(first) - Ad[-1].dot(last)
@@ -263,11 +278,11 @@ class Calibration:
 
         ``Ad`` (k + 1, p, 6) is along the whole pieces, ``Ad_at_ends`` (s, p, 6) at the instants.
         """
-        counts, rates = held.counts, len(self._calibrated)
-        of_rates = Ad[:, :, self._calibrated]
+        counts, rates = held.counts, len(self._rows)
+        of_rates = Ad[:, :, self._rows]
         shares = self._shares(held.whole)
         until = se3.summed_until((of_rates[:-1] + of_rates[1:]) * shares)[counts]
-        last = of_rates[counts] + Ad_at_ends[:, :, self._calibrated]
+        last = of_rates[counts] + Ad_at_ends[:, :, self._rows]
         F = np.zeros((len(counts), Ad.shape[1], self.count))
         F[:, :, :rates] = until + last * self._shares(held.last)
         if self.delay_error_ns and at_ends is not None:
@@ -284,9 +299,8 @@ class Calibration:
         return shares
 
     def _rates(self, measured_velocities: FloatArray) -> FloatArray:
-        """Return (k, …) how fast each scale and bias moves the robot per unit of its error."""
-        rates: FloatArray = measured_velocities.take(self._calibrated, axis=1)
-        rates[:, self._scales :] = _moves(measured_velocities)[:, None]
+        """Return (k, …) how fast each entry of [M b] moves the robot per unit of its error."""
+        rates: FloatArray = with_moves(measured_velocities).take(self._columns, axis=1)
         return rates
 
     def initial_covariance(self) -> FloatArray:
@@ -295,26 +309,51 @@ class Calibration:
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
-        self._values = None
-        self._all[self._estimated] += change[: self.of_velocity]
-        for sensor in self.sensors.values():
-            sensor.shift(change[self.columns(sensor)])
-        least_s = min(MIN_DELAY_S, self._nominal[DELAY])
-        self._all[DELAY] = min(max(self._all[DELAY], least_s), MAX_DELAY_S)
-        self.delay_ns = to_ns(float(self._all[DELAY]))
+        self._owner.calibration[self._places] = self.shifted(change)
+
+    def shifted(self, change: FloatArray) -> FloatArray:
+        """Return the estimates (c,) after that; the delay stays within what can be made up for."""
+        values: FloatArray = self.values + change
+        if self.delay_error_ns:
+            least_s = min(MIN_DELAY_S, self._nominal[DELAY])
+            delay = self.of_velocity - 1
+            values[delay] = min(max(values[delay], least_s), MAX_DELAY_S)
+        return values
+
+
+def with_moves(body_velocities: FloatArray) -> FloatArray:
+    """Return (V, 1) (…, 7) of velocities V (…, 6), or zero where these are exactly zero."""
+    velocities = np.empty((*body_velocities.shape[:-1], 7))
+    velocities[..., :MOVES] = body_velocities
+    velocities[..., MOVES] = _moves(body_velocities)
+    return velocities
+
+
+def _moves(body_velocities: FloatArray) -> BoolArray:
+    """Return whether velocities (…, 6) are not exactly zero (…)."""
+    return np.asarray(body_velocities.any(axis=-1))
+
+
+def calibrated(rates: FloatArray, body_velocities: FloatArray) -> FloatArray:
+    """Return velocities (…, 6) as M V + b, of [M b] (6, 7); exact zeros stay so."""
+    # Wheels that stand turn no robot, however unlike, and no gyroscope gives zero on all axes.
+    biases = _moves(body_velocities)[..., None] * rates[:, MOVES]
+    velocities: FloatArray = body_velocities @ rates[:, :MOVES].T + biases
+    return velocities
 
 
 def stated_of_velocity(settings: Settings) -> FloatArray:
-    """Return what the settings state of the velocity (13,): factors 1 + s, biases b and τ."""
-    return np.array(
-        [
-            *settings.angular_scale,
-            *settings.linear_scale,
-            *settings.angular_bias,
-            *settings.linear_bias,
-            settings.velocity_delay,
-        ]
-    )
+    """Return what the settings state of the velocity (43,): [M b] and τ."""
+    return _of_velocity(settings, '')
+
+
+def _of_velocity(settings: Settings, suffix: str) -> FloatArray:
+    """Return what the parameters whose names end in ``suffix`` say of [M b] and τ (43,)."""
+    values = np.zeros(SENSORS)
+    for entry in OF_VELOCITY:
+        stated = getattr(settings, entry.parameter + suffix)
+        values[entry.place] = stated if entry.axis is None else stated[entry.axis]
+    return values
 
 
 def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
@@ -329,28 +368,16 @@ def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
 
 def without_calibration(settings: Settings) -> Settings:
     """Return settings that estimate nothing of the calibration, as stated as it may be."""
-    zero = (0.0, 0.0, 0.0)
-    return replace(
-        without_sensor_calibration(settings),
-        angular_scale_stddev=zero,
-        linear_scale_stddev=zero,
-        angular_bias_stddev=zero,
-        linear_bias_stddev=zero,
-        velocity_delay_stddev=0.0,
-    )
+    return _certain(without_sensor_calibration(settings), VELOCITY_STDDEVS)
 
 
 def without_sensor_calibration(settings: Settings) -> Settings:
     """Return settings that take sensors to be mounted, and to err, just as stated."""
-    zero = (0.0, 0.0, 0.0)
-    return replace(
-        settings,
-        sensor_rotation_stddev=zero,
-        sensor_translation_stddev=zero,
-        range_scale_stddev=0.0,
-    )
+    return _certain(settings, SENSOR_STDDEVS)
 
 
-def _moves(body_velocities: FloatArray) -> BoolArray:
-    """Return whether velocities (…, 6) are not exactly zero (…)."""
-    return np.asarray(body_velocities.any(axis=-1))
+def _certain(settings: Settings, stddevs: tuple[str, ...]) -> Settings:
+    """Return settings in which some standard deviations are zero."""
+    zero: dict[bool, Any] = {True: (0.0, 0.0, 0.0), False: 0.0}
+    are_vectors = {name: isinstance(getattr(settings, name), tuple) for name in stddevs}
+    return replace(settings, **{name: zero[is_vector] for name, is_vector in are_vectors.items()})

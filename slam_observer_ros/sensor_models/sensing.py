@@ -29,17 +29,18 @@ def corrected(
     Points of a depth that is taken for a range are as much further off as 1/cos b makes them, at
     the angle b off the sensor's axis.
     """
-    sensor = calibration.sensors[event.sensor_frame]
+    frame = event.sensor_frame
+    values, number = calibration.sensor(frame), calibration.sensors.index(frame)
     origins = np.zeros_like(event.points) if event.sensor is None else event.sensor
     arms = event.points - origins
     if settings.range_is_depth:
         arms = arms / cosines(arms, event.sensor_axis)[:, None]
-    sensed = Sensed(np.full(len(arms), sensor.number), origins, arms, event.orientations)
-    covariances, velocities, R = event.covariances, event.velocities, so3.exp(sensor.values[:3])
+    sensed = Sensed(np.full(len(arms), number), origins, arms, event.orientations)
+    covariances, velocities, R = event.covariances, event.velocities, so3.exp(values[:3])
     if covariances is not None:
         squared = np.einsum('ij,ij->i', arms, arms)
         shown = np.einsum('ij,ij->i', event.lines_of_sight, event.lines_of_sight)
-        longer = math.exp(2.0 * sensor.values[6]) * squared / np.maximum(shown, _TINY)
+        longer = math.exp(2.0 * values[6]) * squared / np.maximum(shown, _TINY)
         covariances = longer[:, None, None] * (R @ covariances @ R.T)
     if velocities is not None:
         velocities = velocities @ R.T
@@ -52,7 +53,7 @@ def corrected_again(calibration: Calibration, event: ObservationEvent) -> Observ
     sensed, Z = event.sensed, event.orientations
     if sensed is None:
         return event
-    values = calibration.sensors[event.sensor_frame].values
+    values = calibration.sensor(event.sensor_frame)
     R, scale = so3.exp(values[:3]), math.exp(values[6])
     sensor = sensed.origins + values[3:6]
     points = sensed.arms.dot(scale * R.T) + sensor
@@ -70,10 +71,9 @@ def point_sensitivity(
     """Return D (m, 3, c) at ``points`` (m, 3) of a corrected observation, body frame; or None."""
     if event.sensed is None or event.sensor is None or not calibration.calibrates_sensors:
         return None
-    sensor = calibration.sensors[event.sensor_frame]
-    D = np.zeros((len(points), 3, calibration.count))
-    of_sensor = sensitivity(sensor.values, points - event.sensor)
-    D[:, :, calibration.columns(sensor)] = of_sensor[:, :, sensor.estimated]
+    frame, D = event.sensor_frame, np.zeros((len(points), 3, calibration.count))
+    of_sensor = sensitivity(calibration.sensor(frame), points - event.sensor)
+    D[:, :, calibration.columns(frame)] = of_sensor[:, :, calibration.of_sensor]
     return D
 
 
@@ -81,9 +81,9 @@ def turn_sensitivity(calibration: Calibration, event: ObservationEvent) -> Float
     """Return (3, c), how orientations seen turn with the calibration, body frame; or None."""
     if event.sensed is None or not calibration.calibrates_sensors:
         return None
-    sensor = calibration.sensors[event.sensor_frame]
-    D = np.zeros((3, calibration.count))
-    D[:, calibration.columns(sensor)] = turning(sensor.values)[:, sensor.estimated]
+    frame, D = event.sensor_frame, np.zeros((3, calibration.count))
+    of_sensor = turning(calibration.sensor(frame))
+    D[:, calibration.columns(frame)] = of_sensor[:, calibration.of_sensor]
     return D
 
 

@@ -11,7 +11,13 @@ import numpy as np
 
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import AngularVelocityEvent, flatten_velocities, VelocityBlock
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    flatten_velocities,
+    MeasuredVelocity,
+    VelocityBlock,
+    VelocityEvent,
+)
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
 
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
@@ -59,7 +65,7 @@ class VelocityHistory:
         self._angular: AngularVelocityEvent | None = None
         self._periods, self._angular_periods = _Periods(), _Periods()
 
-    def append(self, measured: VelocityBlock | AngularVelocityEvent) -> bool:
+    def append(self, measured: MeasuredVelocity) -> bool:
         """Add what is not earlier than anything else; return whether it leads on.
 
         An angular velocity does not before the first linear one is known: it waits for that.
@@ -69,34 +75,42 @@ class VelocityHistory:
             self._angular = measured
             if self._count == 1:
                 return False
-            rows = self._new_rows(1)
-            self._joined.repeat_last(rows.start, measured.stamp_ns)
-            self._joined.usual_s[rows] = self._usual_s()
+            first = self._new_row(1)
+            self._joined.repeat_last(first, measured.stamp_ns)
+            self._joined.usual_s[first, 1] = self._periods.usual_s
+        elif isinstance(measured, VelocityEvent):
+            first, one, usual_s = self._new_row(1), measured, self._took(measured)
+            self._joined.write(first, one.stamp_ns, one.body_velocity, one.covariance, usual_s)
         else:
-            rows = self._new_rows(len(measured))
-            self._joined.write(rows, measured, self._took(measured))
-            if self._angular is not None:
-                self._joined.usual_s[rows, 0] = self._angular_periods.usual_s
+            first, many, usual_s = self._new_row(len(measured)), measured, self._took(measured)
+            rows = slice(first, self._count)
+            self._joined.write(
+                rows, many.stamps_ns, many.body_velocities, many.covariances, usual_s
+            )
         if (angular := self._angular) is not None:
-            stamps_ns = self._joined.stamps_ns[rows]
+            self._joined.usual_s[first : self._count, 0] = self._angular_periods.usual_s
+            stamps_ns = self._joined.stamps_ns[first : self._count]
             begin = stamps_ns.searchsorted(angular.stamp_ns)
             end = stamps_ns.searchsorted(angular.stamp_ns + self._timeout_ns, 'right')
-            self._joined.write_angular(slice(rows.start + begin, rows.start + end), angular)
+            self._joined.write_angular(slice(first + begin, first + end), angular)
         return True
 
-    def _new_rows(self, k: int) -> slice:
-        """Make room for so many more."""
+    def _new_row(self, k: int) -> int:
+        """Make room for so many more; return the first."""
         first, self._count = self._count, self._count + k
-        if self._count > self._joined.capacity:
+        if self._count > len(self._joined.stamps_ns):
             self._joined = self._joined.copied(slice(first), 2 * self._count)
-        return slice(first, self._count)
+        return first
 
-    def _took(self, velocities: VelocityBlock) -> FloatArray | float:
-        """Return for how long each was in force as a rule when these came, (k, 1) seconds."""
+    def _took(self, velocities: VelocityEvent | VelocityBlock) -> FloatArray | float:
+        """Return for how long each was in force as a rule when it came, seconds."""
         if velocities.is_mean:  # their errors do not go on, however long they are held
             return self._periods.usual_s
-        usual_s = [self._periods.add(stamp_ns) for stamp_ns in velocities.stamps_ns.tolist()]
-        return usual_s[0] if len(usual_s) == 1 else np.array(usual_s)[:, None]
+        if isinstance(velocities, VelocityEvent):
+            return self._periods.add(velocities.stamp_ns)
+        return np.array(
+            [self._periods.add(stamp_ns) for stamp_ns in velocities.stamps_ns.tolist()]
+        )
 
     def _row(self, stamp_ns: int, side: Literal['left', 'right'] = 'right') -> int:
         """Return the first row behind a stamp, or with ``'left'`` the first at it or behind."""
@@ -238,7 +252,7 @@ class VelocityHistory:
         first, count = self._row(stamp_ns) - 1, self._count
         if first > count // 2:
             kept = np.append(0, np.arange(first, count))
-            self._joined = self._joined.copied(kept, self._joined.capacity)
+            self._joined = self._joined.copied(kept, len(self._joined.stamps_ns))
             self._count = len(kept)
 
     def _held(self, pieces: _Pieces) -> HeldVelocities:
@@ -350,11 +364,6 @@ class _Joined:
             np.full((capacity, 2), np.inf),
         )
 
-    @property
-    def capacity(self) -> int:
-        """How many velocities there is room for."""
-        return len(self.since_ns)
-
     def copied(self, rows: slice | IntArray, capacity: int) -> _Joined:
         """Return some of the velocities, with room for ``capacity`` of them."""
         roomy = _Joined.with_room_for(capacity)
@@ -363,16 +372,24 @@ class _Joined:
             getattr(roomy, field.name)[: len(kept)] = kept
         return roomy
 
-    def write(self, rows: slice, velocities: VelocityBlock, usual_s: FloatArray | float) -> None:
-        """Fill in rows, once: others may see them."""
-        self.stamps_ns[rows] = velocities.stamps_ns
-        self.body_velocities[rows] = velocities.body_velocities
-        self.since_ns[rows] = velocities.stamps_ns[:, None]
-        self.usual_s[rows] = usual_s
-        if (covariances := velocities.covariances) is not None:
+    def write(
+        self,
+        rows: slice | int,
+        stamps_ns: IntArray | int,
+        body_velocities: FloatArray,
+        covariances: FloatArray | None,
+        usual_s: FloatArray | float,
+    ) -> None:
+        """Fill in one row or several, once: others may see them."""
+        self.stamps_ns[rows] = stamps_ns
+        self.body_velocities[rows] = body_velocities
+        # Entry by entry, which of one row takes a quarter of the time.
+        self.since_ns[rows, 0] = self.since_ns[rows, 1] = stamps_ns
+        self.usual_s[rows, 0] = self.usual_s[rows, 1] = usual_s
+        if covariances is not None:
             self.covariances[rows] = covariances
-            self.is_stated[rows, 0] = covariances[:, :3, :3].any(axis=(1, 2))
-            self.is_stated[rows, 1] = covariances[:, 3:, 3:].any(axis=(1, 2))
+            self.is_stated[rows, 0] = covariances[..., :3, :3].any(axis=(-2, -1))
+            self.is_stated[rows, 1] = covariances[..., 3:, 3:].any(axis=(-2, -1))
 
     def repeat_last(self, row: int, stamp_ns: int) -> None:
         """Fill in a row with what is in force before it, from a stamp on."""

@@ -248,10 +248,10 @@ class State:
             )
         # From the reference frame to the world.
         (step, slips), rows = self.relinearisation.smooth(), self.confirmed
-        found, calibration = step.end, self.calibration.copy()
+        found, calibration = step.end, self.calibration
         entries = slice(self.axes.p, self.axes.p + calibration.count)
         covariance = step.marginal()[entries, entries]
-        calibration.shift(found.calibrations[-1] - calibration.values)
+        values = calibration.shifted(found.calibrations[-1] - calibration.values)
         history, P = self.relinearisation.history, self.observer.reference_pose
         turned = found.orientations
         return Smoothed(
@@ -262,6 +262,6 @@ class State:
             since=history.since,
             slips=slips,
             orientations=None if turned is None else P[:3, :3] @ turned[rows],
-            calibration=calibration.estimates(np.diagonal(covariance)),
+            calibration=calibration.estimates(np.diagonal(covariance), values),
             calibration_correlations=correlations_of(covariance),
         )

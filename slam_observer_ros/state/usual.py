@@ -280,8 +280,8 @@ def _estimate_of(
         size,
         first,
         state.settings.two_d_mode,
-        calibration._all,
-        calibration._estimated,
+        calibration.rates,
+        calibration.velocity_places,
         calibration.drift_covariance,
     )
 
@@ -324,9 +324,9 @@ def _seen(state: State, event: ObservationEvent, places: IntArray) -> Seen:
     calibration = state.calibration
     values, estimated, column = None, NO_IDS, 0
     if calibration.corrects_points:
-        sensor = calibration.sensors[event.sensor_frame]
-        values, estimated = sensor.values, sensor.estimated
-        column = calibration.columns(sensor).start
+        frame = event.sensor_frame
+        values, estimated = calibration.sensor(frame), calibration.of_sensor
+        column = calibration.columns(frame).start
     if state.settings.range_is_depth:
         cosines = sensing.cosines(arms, event.sensor_axis)
         arms = arms / cosines[:, None]
@@ -353,7 +353,7 @@ def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Key
     """Return what is needed to linearise again what was seen."""
     seen, out, sensed = corrected.seen, corrected.out, None
     if seen.sensor is not None:
-        number = state.calibration.sensors[event.sensor_frame].number
+        number = state.calibration.sensors.index(event.sensor_frame)
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(seen.arms), number), origins, seen.arms)
     stated = out.covariances if len(out.covariances) else None

@@ -26,7 +26,6 @@ from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
     ObservationEvent,
-    queued,
     UNKNOWN_ID,
     VelocityEvent,
 )
@@ -473,7 +472,7 @@ def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved
     for hypothesis, yaw_rad in zip(hypotheses._all, [0.0, 0.4], strict=True):
         hypothesis.state.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
     velocities, end_ns = VelocityHistory(10**10), 6 * 10**9
-    velocities.append(queued(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))))
+    velocities.append(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
     _, before = hypotheses.pose_after(velocities, 0, end_ns)
     hypotheses.propagate(velocities, 0, end_ns)
     assert_allclose(before, hypotheses.pose_after(velocities, end_ns, end_ns)[1], atol=1e-9)

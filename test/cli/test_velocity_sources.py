@@ -18,12 +18,11 @@ from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
     ObservationEvent,
-    queued,
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.odometry import PoseDifferences
-from slam_observer_ros.nodes.intake.clocks import ClockOffset, SAMPLES
+from slam_observer_ros.nodes.intake.lateness import ClockOffset, SAMPLES
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -146,7 +145,7 @@ def history_of(events):
     """Return the history of events that were received in this order."""
     queue, history = EventQueue(10 * SECOND, 10 * SECOND, SECOND), VelocityHistory(SECOND)
     for event in events:
-        queue.push(queued(event))  # raises if it is a duplicate
+        queue.push(event)  # raises if it is a duplicate
     for event in queue.pop_all():
         history.append(event)
     return history
@@ -171,7 +170,7 @@ def test_errors_of_two_sensors_have_nothing_to_do_with_each_other():
     history = VelocityHistory(SECOND)
     correlated = np.eye(6) + 0.5
     assert not history.append(AngularVelocityEvent(0, np.zeros(3), 0.01 * np.eye(3)))
-    assert history.append(queued(VelocityEvent(0, np.zeros(6), correlated)))
+    assert history.append(VelocityEvent(0, np.zeros(6), correlated))
     (covariance,) = history.held(0, SECOND // 10).covariances
     assert_array_equal(covariance[:3, :3], 0.01 * np.eye(3))
     assert_array_equal(covariance[3:, 3:], correlated[3:, 3:])
@@ -182,7 +181,7 @@ def test_errors_of_two_sensors_have_nothing_to_do_with_each_other():
 def test_a_velocity_is_in_force_until_its_timeout_has_passed():
     history = VelocityHistory(SECOND)
     assert history.latest(0) is None
-    assert history.append(queued(VelocityEvent(5 * SECOND, np.ones(6))))
+    assert history.append(VelocityEvent(5 * SECOND, np.ones(6)))
     assert history.latest(5 * SECOND - 1) is None
     for stamp_ns in (5 * SECOND, 6 * SECOND):
         assert_array_equal(history.latest(stamp_ns), np.ones(6))
@@ -201,7 +200,7 @@ def test_an_imu_whose_covariance_is_zero_does_not_know_it():
 def test_an_imu_alone_is_no_velocity():
     history = VelocityHistory(SECOND)
     assert not history.append(imu(0.0, [0.0, 0.0, 1.0])), 'the wheels have not begun'
-    assert history.append(queued(wheels(0.1, V)))
+    assert history.append(wheels(0.1, V))
     for time_s in (0.5, 1.0, 1.5):
         history.append(imu(time_s, [0.0, 0.0, 1.0]))
     assert history.latest(START_NS + SECOND) is not None

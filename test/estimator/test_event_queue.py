@@ -16,7 +16,6 @@ from slam_observer_ros.estimator.event_queue import EventQueue, MIN_KNOWN
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     ObservationEvent,
-    queued,
     VelocityBlock,
     VelocityEvent,
 )
@@ -26,7 +25,7 @@ START_NS = 1_700_000_000 * SECOND
 
 
 def velocity(stamp_ns):
-    return queued(VelocityEvent(START_NS + stamp_ns, np.zeros(6)))
+    return VelocityEvent(START_NS + stamp_ns, np.zeros(6))
 
 
 def received(event, receive_ns):

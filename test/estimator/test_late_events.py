@@ -29,7 +29,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.timeline import MAX_PENDING_VELOCITIES, Timeline
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, queued, VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
@@ -133,7 +133,7 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(m, a
     timeline = Timeline(Hypotheses(State(make_gains(settings, np.eye(4)), settings)), settings)
     turning = np.array([0.0, 0.0, 1e-9, 0.0, 0.0, 0.0])
     for step in range(21):
-        timeline.append(queued(velocity(0.1 * step, turning)))
+        timeline.append(velocity(0.1 * step, turning))
     timeline.catch_up()
     given_m2 = np.tile(0.01 * np.eye(3), (m, 1, 1)) if are_given else None
     points = np.tile([5.0, 0.0, 0.0], (m, 1))
@@ -158,7 +158,7 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
     timeline = Timeline(hypotheses, settings)
     turning = np.array([0.0, 0.0, turn_rad / 0.9, 0.0, 0.0, 0.0])
     for step in range(11):
-        timeline.append(queued(velocity(0.1 * step, turning)))
+        timeline.append(velocity(0.1 * step, turning))
     timeline.catch_up()
     seen, speed = np.array([[5.0, 0.0, 0.0]]), np.array([[4.0, 0.0, 0.0]])
     event = ObservationEvent(START_NS + 10**8, np.array([1]), seen, velocities=speed)
@@ -285,7 +285,7 @@ def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
     state_step.step(state, match(state, event))
     state.observer.body_points = Mock(return_value=event.points)
     velocities = VelocityHistory(timeout_ns=10**9)
-    velocities.append(queued(velocity(0.0, np.zeros(6))))
+    velocities.append(velocity(0.0, np.zeros(6)))
     carried_forward(state, event, velocities, event.stamp_ns + 10**8)
     np.testing.assert_array_equal(state.observer.body_points.call_args.args[0], [0, 1])
 

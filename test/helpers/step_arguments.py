@@ -30,8 +30,8 @@ def random_covariance(rng, size, scale=0.1):
 def random_estimate(rng, n=None):
     is_planar = bool(rng.integers(2))
     p, k = (3, 2) if is_planar else (6, 3)
-    velocity_entries = rng.permutation(12)[: rng.integers(1, 7)]
-    estimated = np.sort(np.append(velocity_entries, 12)).astype(np.int64)
+    velocity_entries = rng.permutation(42)[: rng.integers(1, 7)]
+    estimated = np.append(velocity_entries, 42).astype(np.int64)
     c = len(estimated) + int(rng.integers(0, 4))
     n = int(rng.integers(1, 40)) if n is None else n
     first = p + c + int(rng.integers(0, 9)) * int(rng.integers(2))  # with what is postponed
@@ -39,14 +39,14 @@ def random_estimate(rng, n=None):
     room = size + int(rng.integers(0, 9))
     P = np.zeros((room, room))
     P[:size, :size] = random_covariance(rng, size)
-    calibration = np.append(np.ones(6), np.zeros(7)) + 0.02 * rng.standard_normal(13)
+    rates = np.eye(6, 7) + 0.02 * rng.standard_normal((6, 7))
     A = se3.exp(rng.standard_normal(6))
     y_ref, a = 5.0 * rng.standard_normal((n, 3)), 0.1 * rng.standard_normal((n, 3))
     if is_planar:
         A = se3.flatten(A)
         y_ref[:, 2] = a[:, 2] = 0.0
     drift = np.diag(rng.uniform(0.0, 1e-6, c)) * rng.integers(2)
-    return Estimate(A, y_ref, a, P, size, first, is_planar, calibration, estimated, drift)
+    return Estimate(A, y_ref, a, P, size, first, is_planar, rates, estimated, drift)
 
 
 def random_motion(rng):

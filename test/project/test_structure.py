@@ -45,6 +45,12 @@ def test_a_step_with_ids_takes_no_more_calls_than_it_did(structure):
     assert step.depth <= 12
 
 
+def test_a_velocity_takes_no_more_calls_than_it_did(structure):
+    velocity = structure.traced_velocity()
+    assert velocity.functions <= 21
+    assert len(velocity.modules) <= 5
+
+
 def test_docstrings_are_a_fifth_of_all_lines_at_most(structure):
     docstrings, lines = structure.docstring_lines()
     assert docstrings <= 0.2 * lines

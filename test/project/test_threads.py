@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from slam_observer_ros.common.computing import CHOICES
+from slam_observer_ros.common.process import CHOICES
 
 NODE = """
 import sys
@@ -25,7 +25,7 @@ LIBRARY = """
 import slam_observer_ros.estimator.estimator
 """
 PROGRAM = """
-from slam_observer_ros.common.computing import use_one_thread
+from slam_observer_ros.common.process import use_one_thread
 use_one_thread()
 from slam_observer_ros import Estimator
 """

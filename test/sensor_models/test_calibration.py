@@ -18,8 +18,15 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.runs.health import of_calibration
-from slam_observer_ros.sensor_models.calibration import Calibration, MIN_DELAY_S
+from slam_observer_ros.sensor_models import calibration as calibrations
+from slam_observer_ros.sensor_models.calibration import (
+    Calibration,
+    Entry,
+    MIN_DELAY_S,
+    OF_VELOCITY,
+)
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
@@ -222,7 +229,9 @@ def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
 
 def test_a_delay_stays_within_what_is_made_up_for():
     calibration = Calibration(
-        Settings(velocity_delay_stddev=0.1, angular_bias_stddev=NO_BIAS), PLANAR
+        FilterArrays(np.eye(4)),
+        Settings(velocity_delay_stddev=0.1, angular_bias_stddev=NO_BIAS),
+        PLANAR,
     )
     for change_s, limit_s in ((-5.0, MIN_DELAY_S), (10.0, MAX_DELAY_S)):
         calibration.shift(np.array([change_s]))
@@ -364,14 +373,14 @@ def test_constant_gains_estimate_none_of_them():
 
 @pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 3), (PLANAR, 1)])
 def test_a_bias_of_the_angular_velocity_and_a_delay_are_estimated_unasked(axes, count):
-    calibration = Calibration(Settings(), axes)
+    calibration = Calibration(FilterArrays(np.eye(4)), Settings(), axes)
     names = [part.name for part in calibration.estimates(np.ones(count + 1))]
     assert names == [*(f'angular_bias_{axis}' for axis in 'xyz'[3 - count :]), 'velocity_delay']
 
 
 @pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 13), (PLANAR, 7)])
 def test_only_axes_of_the_motion_are_calibrated(axes, count):
-    calibration = Calibration(EVERYTHING, axes)
+    calibration = Calibration(FilterArrays(np.eye(4)), EVERYTHING, axes)
     assert calibration.count == count
     calibration.shift(np.full(count, 0.5))
     fixed = np.delete(np.arange(6), axes.pose)
@@ -382,7 +391,7 @@ def test_only_axes_of_the_motion_are_calibrated(axes, count):
 
 @given(generators(), st.sampled_from([SPATIAL, PLANAR]))
 def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
-    calibration, pieces, dt_s = Calibration(EVERYTHING, axes), 5, 0.01
+    calibration, pieces, dt_s = Calibration(FilterArrays(np.eye(4)), EVERYTHING, axes), 5, 0.01
     V = np.zeros((pieces, 6))
     V[:, axes.pose] = rng.normal(size=(pieces, axes.p))
     start = se3.exp(axes.full_pose(rng.normal(size=axes.p)))
@@ -408,6 +417,27 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
         np.testing.assert_allclose(F[:, column], error, atol=1e-3 * dt_s * pieces)
 
 
+@pytest.mark.parametrize('gains', ['riccati', 'scheduled'])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_one_more_state_of_velocities_takes_two_parameters_and_a_row(
+    monkeypatch, gains, two_d_mode
+):
+    sideways, turning = 4, 2
+    row = Entry('side_slip', 'side_slip', None, 7 * sideways + turning, 'm/rad')
+    with_row = (*OF_VELOCITY[:-1], row, OF_VELOCITY[-1])
+    monkeypatch.setattr(calibrations, 'OF_VELOCITY', with_row)
+    monkeypatch.setattr(Settings, 'side_slip', 0.0, raising=False)
+    monkeypatch.setattr(Settings, 'side_slip_stddev', 0.2, raising=False)
+    settings = Settings(gains=gains, two_d_mode=two_d_mode, reorder_window=0.0)
+    slips = np.zeros((600, 6))
+    slips[:, sideways] = 0.1 * true_velocities(600, two_d_mode)[:, turning]
+    estimator = estimate(drive(settings, 30.0, bias=slips), settings)
+    (found,) = (part for part in estimator.calibration if part.name == 'side_slip')
+    assert found.unit == 'm/rad' and found.stated == 0.2
+    assert found.deviation < 0.05
+    assert abs(found.value - 0.1) < 3.0 * found.deviation
+
+
 def test_drift_lets_the_uncertainty_grow_with_time():
     settings = Settings(
         angular_bias_stddev=(0.0, 0.0, 0.02),
@@ -415,7 +445,7 @@ def test_drift_lets_the_uncertainty_grow_with_time():
         velocity_delay_stddev=0.0,
         calibration_drift=0.5,
     )
-    calibration = Calibration(settings, SPATIAL)
+    calibration = Calibration(FilterArrays(np.eye(4)), settings, SPATIAL)
     P = calibration.initial_covariance()
     still = Motion(
         np.tile(np.eye(4), (5, 1, 1)),
@@ -454,7 +484,7 @@ def test_relinearising_does_not_undo_that_a_scale_has_changed():
 
 def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
     """As a robot that is carried; though its velocity has a bias, which is no motion either."""
-    calibration = Calibration(EVERYTHING, SPATIAL)
+    calibration = Calibration(FilterArrays(np.eye(4)), EVERYTHING, SPATIAL)
     calibration.shift(np.full(calibration.count, 0.1))
     path = np.array([np.eye(4), se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))])
     zero = np.zeros(1)

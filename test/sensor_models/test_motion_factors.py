@@ -11,6 +11,7 @@ import pytest
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.runs.health import of_noise
 from slam_observer_ros.runs.reported_run import NisTally
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -129,7 +130,7 @@ def test_gaps_and_a_robot_that_stands_say_nothing():
     ('velocity', 'dt_s', 'is_slip'), [(0.0, 0.1, False), (1.0, 0.0, False), (1.0, 0.1, True)]
 )
 def test_of_what_motion_nothing_can_be_learnt(velocity, dt_s, is_slip):
-    calibration = Calibration(RIGHT, axes_of(True))
+    calibration = Calibration(FilterArrays(np.eye(4)), RIGHT, axes_of(True))
     path, noise = np.array([np.eye(4)] * 2), np.eye(6)[None]
     motion = Motion(path, np.full((1, 6), 1.0), np.array([0.1]), noise, 0.1, None, calibration)
     of_turning, of_driving = motion.noise_by_kind

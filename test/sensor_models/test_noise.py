@@ -15,11 +15,11 @@ from slam_observer_ros.events import (
     AngularVelocityEvent,
     flatten,
     ObservationEvent,
-    queued,
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
@@ -182,8 +182,8 @@ def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
     def way(V):
         history = VelocityHistory(10**9)
         for piece, velocity in enumerate(V):
-            history.append(queued(VelocityEvent(piece * dt_ns, velocity)))
-        return history, Calibration(Settings(), SPATIAL)
+            history.append(VelocityEvent(piece * dt_ns, velocity))
+        return history, Calibration(FilterArrays(np.eye(4)), Settings(), SPATIAL)
 
     def error(piece, w):
         moved = V.copy()
@@ -210,7 +210,7 @@ def test_the_error_of_a_message_goes_on_while_none_follows():
         history = VelocityHistory(SECOND)
         for step in range(20):
             stamp_ns = round(step * period_s * SECOND)
-            history.append(queued(VelocityEvent(stamp_ns, np.zeros(6), covariance)))
+            history.append(VelocityEvent(stamp_ns, np.zeros(6), covariance))
 
         def between(start_s, end_s):
             held = history.held(round(start_s * SECOND), round(end_s * SECOND))
@@ -236,7 +236,7 @@ def test_the_error_of_lost_wheels_goes_on_beside_an_imu(imu_rate_hz):
     lost_since_ns = 12 * SECOND // 10
     kept = [event for event in wheels if event.stamp_ns <= lost_since_ns]
     for event in sorted([*kept, *imu], key=lambda event: event.stamp_ns):
-        history.append(queued(event))
+        history.append(event)
     Q = MotionNoise(settings).covariances(history.held(lost_since_ns, end_ns)).sum(axis=0)
     np.testing.assert_allclose(np.diag(Q)[3:], 0.02**2 * 0.8**2 / 0.05, rtol=1e-6)
     angular = np.square(settings.angular_velocity_noise) * 0.8
@@ -246,7 +246,7 @@ def test_the_error_of_lost_wheels_goes_on_beside_an_imu(imu_rate_hz):
 def test_a_mean_between_two_poses_leads_to_the_second_however_far_that_is():
     settings, history = Settings(linear_velocity_noise=(0.02,) * 3), VelocityHistory(SECOND)
     for step in (0, 1, 2, 3, 4, 16, 17):
-        history.append(queued(VelocityEvent(step * SECOND // 20, np.ones(6), is_mean=True)))
+        history.append(VelocityEvent(step * SECOND // 20, np.ones(6), is_mean=True))
     Q = MotionNoise(replace(settings, linear_scale_noise=(0.0,) * 3)).covariances(
         history.held(4 * SECOND // 20, 16 * SECOND // 20)
     )
@@ -263,7 +263,7 @@ def test_slip_goes_on_as_before_while_no_message_comes():
     )
     history = VelocityHistory(SECOND)
     for step in range(20):
-        history.append(queued(VelocityEvent(step * SECOND // 20, np.array([0, 0, 0, 2.0, 0, 0]))))
+        history.append(VelocityEvent(step * SECOND // 20, np.array([0, 0, 0, 2.0, 0, 0])))
     (Q,) = MotionNoise(settings).covariances(history.held(SECOND, SECOND + 6 * SECOND // 10))
     np.testing.assert_allclose(Q, np.diag([0, 0, 0, (0.1 * 2.0) ** 2 * 0.6, 0, 0]), atol=1e-15)
 
@@ -271,7 +271,7 @@ def test_slip_goes_on_as_before_while_no_message_comes():
 def test_commands_that_come_when_they_change_have_no_period():
     history = VelocityHistory(2 * SECOND)
     for time_s in (0.0, 0.05, 0.1, 1.3, 1.35, 2.4, 2.45):
-        history.append(queued(VelocityEvent(round(time_s * SECOND), np.ones(6))))
+        history.append(VelocityEvent(round(time_s * SECOND), np.ones(6)))
     settings = Settings(angular_scale_noise=(0.0,) * 3, linear_scale_noise=(0.0,) * 3)
     (Q,) = MotionNoise(settings).covariances(history.held(round(2.45e9), round(3.45e9)))
     expected = np.square([*settings.angular_velocity_noise, *settings.linear_velocity_noise])
@@ -285,7 +285,7 @@ def test_the_part_of_a_velocity_whose_covariance_is_zero_has_the_settings_noise(
     stated[unknown] = 0.0
     sensor = se3.pose(np.eye(3), np.array([0.3, 0.1, 0.0]))
     history = VelocityHistory(10**9)
-    history.append(queued(VelocityEvent(0, np.ones(6), stated).moved(sensor)))
+    history.append(VelocityEvent(0, np.ones(6), stated).moved(sensor))
     (Q,) = MotionNoise(Settings()).covariances(history.held(0, 10**8))
     (expected,) = MotionNoise(Settings()).covariances(held(np.ones((1, 6)), [0.1]))
     np.testing.assert_allclose(Q[unknown, unknown], expected[unknown, unknown])

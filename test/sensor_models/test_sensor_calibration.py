@@ -17,6 +17,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.runs.health import of_mounting
@@ -61,6 +62,7 @@ def erring(world, settings, turned=TURNED, shifted=SHIFTED, longer=LONGER, **whe
 
 def calibrated(settings):
     calibration = Calibration(
+        FilterArrays(np.eye(4)),
         replace(settings, angular_bias_stddev=NONE, velocity_delay_stddev=0.0),
         axes_of(settings.two_d_mode),
     )
@@ -148,7 +150,13 @@ def test_what_is_off_is_found_within_its_uncertainty(settings, relinearization_i
     estimator, plain = (
         estimate(world, changed) for changed in (settings, replace(settings, **WITHOUT_ESTIMATES))
     )
-    truth = dict(zip(calibrations.SENSOR_NAMES, [*TURNED, *SHIFTED, LONGER], strict=True))
+    truth = dict(
+        zip(
+            (entry.name for entry in calibrations.OF_SENSOR),
+            [*TURNED, *SHIFTED, LONGER],
+            strict=True,
+        )
+    )
     for part in estimator.calibration:
         assert abs(part.value - truth[part.name]) < 3.5 * part.deviation
         assert part.deviation < part.stated
@@ -288,7 +296,13 @@ def test_in_a_surveyed_map_it_is_found_fast(settings, mode):
     for event in world.events:
         estimator.add(event)
     estimator.flush()
-    truth = dict(zip(calibrations.SENSOR_NAMES, [*TURNED, *SHIFTED, LONGER], strict=True))
+    truth = dict(
+        zip(
+            (entry.name for entry in calibrations.OF_SENSOR),
+            [*TURNED, *SHIFTED, LONGER],
+            strict=True,
+        )
+    )
     for part in estimator.calibration:
         assert abs(part.value - truth[part.name]) < 3.5 * part.deviation
         assert part.deviation < 0.25 * part.stated
@@ -331,6 +345,4 @@ def test_what_was_found_is_said_as_what_to_set(name, value, text):
     assert said == text or text in said != ''
 
 
-UNITS = dict(zip(calibrations.SENSOR_NAMES, calibrations.SENSOR_UNITS, strict=True)) | {
-    'linear_scale_x': ''
-}
+UNITS = {entry.name: entry.unit for entry in calibrations.OF_SENSOR} | {'linear_scale_x': ''}

@@ -28,6 +28,7 @@ from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -140,7 +141,7 @@ def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
     path, covariances = np.array(path), random_covariances(rng, k, 6, 0.1)
 
     def keyframes(*cuts):
-        calibration = Calibration(settings, axes)
+        calibration = Calibration(FilterArrays(np.eye(4)), settings, axes)
         count = d + calibration.count
         start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
         history = History(axes, ObservationNoise(settings), start, 'the start')
@@ -162,7 +163,7 @@ def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
 def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     d = axes.p
     settings = Settings(linear_scale_stddev=(0.1, 0.1, 0.1), angular_bias_stddev=(0.0, 0.0, 0.1))
-    calibration = Calibration(settings, axes)
+    calibration = Calibration(FilterArrays(np.eye(4)), settings, axes)
     c = calibration.count
     start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(d + c))
     history = History(axes, ObservationNoise(settings), start, 'the start')

@@ -81,6 +81,19 @@ def test_a_copy_of_a_state_and_the_state_change_apart_and_alike(run):
     np.testing.assert_equal(known_of(one), known_of(other))
 
 
+def test_a_copy_of_a_state_has_its_calibration_in_its_own_arrays_alone(run):
+    settings, events = run
+    estimator = Estimator(settings)
+    for event in events[: len(events) // 2]:
+        estimator.add(event)
+    one = estimator._state
+    other = one.copy()
+    of_one, of_other = vars(one.calibration), vars(other.calibration)
+    assert {name for name in of_one if of_one[name] is not of_other[name]} == {'_owner'}
+    assert of_other['_owner'] is other.observer
+    assert not np.shares_memory(one.observer.calibration, other.observer.calibration)
+
+
 def test_a_deep_copy_of_an_estimator_has_one_owner_too(run):
     settings, events = run
     one, half = Estimator(settings), len(events) // 2

@@ -138,10 +138,10 @@ class RiccatiGains(OrientationGains):
 
     def add_sensor(self, frame: str) -> None:
         """Let the calibration of the sensor of another frame be part of the state, and of P."""
-        sensor = self.calibration.add_sensor(frame)
-        if len(sensor.variances):
+        variances = self.calibration.add_sensor(frame)
+        if len(variances):
             self.joint = self.joint.dense()
-            self.joint.add_calibration(sensor.variances)
+            self.joint.add_calibration(variances)
             self._compress_if_large(0)
 
     def add(
