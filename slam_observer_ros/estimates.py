@@ -151,8 +151,7 @@ class Smoothed:
     ids: IntArray  # (n,)
     since: str
     slips: int
-    # (n, 3, 3) of the landmarks, world, zero where unknown; None if it is not estimated
-    orientations: FloatArray | None
+    orientations: FloatArray  # (n, 3, 3) of the landmarks, world, zero where unknown
     calibration: list[CalibrationEstimate]  # c, of the last pose if it drifts
     calibration_correlations: FloatArray  # (c, c)
 

@@ -23,7 +23,8 @@ from slam_observer_ros.common.errors import (
 from slam_observer_ros.common.files import load_yaml, plain_value, unfinished_file
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import GIVEN_POSE_STD
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import are_covariances, limited
 from slam_observer_ros.known_map.landmark_map import MAX_NUMBER

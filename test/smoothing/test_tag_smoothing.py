@@ -73,7 +73,7 @@ def test_derivatives_of_an_orientation_seen_are_those_of_its_error(axes, rng):
         points=point,
         information=np.zeros((1, k, k)),
         shares=np.ones(1),
-        turns=SeenTurns(Z, Z, W[None]),
+        turns=SeenTurns(np.arange(1), Z, Z, W[None]),
     )
     solution = Solution(np.array([np.eye(4), pose]), np.empty((2, 0)), point, B)
     H, gradient = Observations(axes, keyframes, SETTINGS).normal_equations(solution, 0)

@@ -59,10 +59,11 @@ class RiccatiGains(OrientationGains):
         # its velocity, or the orientation of a tag at rest.
         speed = settings.landmark_velocity_stddev
         velocity = self.axes.point if speed else 0
-        turn = self.axes.turn if settings.use_tag_orientation and not speed else 0
-        unknown = [UNKNOWN_RAD] * turn + [speed] * velocity
+        has_turns = settings.use_tag_orientation and not speed
+        axes = self.axes if has_turns else self.axes.of_points()
+        unknown = [UNKNOWN_RAD] * axes.turn + [speed] * velocity
         joint = JointCovariance(
-            Chart(self.axes, self.calibration.count, turn, velocity),
+            Chart(axes, self.calibration.count, velocity),
             self.observer.covariance,
             self.calibration.initial_covariance(),
             np.array(unknown) ** 2,
