@@ -28,8 +28,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.metrics import ConfigurationError
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
-from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.evaluation.trajectory import interpolate, LandmarkTruth, Trajectory
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap

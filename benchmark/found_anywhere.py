@@ -20,7 +20,7 @@ import outliers
 import tags
 import worlds
 
-from slam_observer_ros.common.computing import use_one_thread
+from slam_observer_ros.common.process import use_one_thread
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import interpolate

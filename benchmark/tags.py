@@ -17,7 +17,7 @@ import numpy as np
 from odometry import Event
 from worlds import drive, Loop, simulated_settings, World
 
-from slam_observer_ros.common.computing import use_one_thread
+from slam_observer_ros.common.process import use_one_thread
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import ConfigurationError
@@ -25,7 +25,7 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.sensor_models.calibration import without_calibration
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.tag_orientations import flipped
+from slam_observer_ros.state.step import flipped
 
 MAX_SEEN = (1, 2, 5)
 SIGMAS_RAD = (0.02, 0.05, 0.15)

@@ -14,8 +14,7 @@ import numpy as np
 from odometry import Event
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.data_sets import load_mrclam, load_starry_night

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.common.signals import StopSignal
+from slam_observer_ros.common.process import StopSignal
 from slam_observer_ros.recording.writer import RecordingWriter
 
 NodeContext: TypeAlias = AbstractContextManager['subprocess.Popen[bytes]']

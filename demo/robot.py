@@ -29,7 +29,7 @@ from rich.progress import Progress
 from robot_report import Interruption, report
 
 from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.common.signals import StopSignal
+from slam_observer_ros.common.process import StopSignal
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import write_map

@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from slam_observer_ros.common.computing import use_one_thread
+    from slam_observer_ros.common.process import use_one_thread
     from slam_observer_ros.estimator.estimator import Estimator
     from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
     from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -31,7 +31,7 @@ _MODULES = {
     'ObservationEvent': 'events',
     'Settings': 'settings.estimator_settings',
     'VelocityEvent': 'events',
-    'use_one_thread': 'common.computing',
+    'use_one_thread': 'common.process',
 }
 """Where the names are defined; none is imported before it is used, as scipy takes a while."""
 

@@ -1,10 +1,12 @@
-"""What the estimator gives out: updates, calibration, noise, smoothed run, names of its counts."""
+"""What the estimator gives out: updates, calibration, noise, counts; and what is kept of a run."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
 import math
+
+import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
@@ -149,7 +151,52 @@ class Smoothed:
     ids: IntArray  # (n,)
     since: str
     slips: int
-    # (n, 3, 3) of the landmarks, world, zero where unknown; None if it is not estimated
-    orientations: FloatArray | None
+    orientations: FloatArray  # (n, 3, 3) of the landmarks, world, zero where unknown
     calibration: list[CalibrationEstimate]  # c, of the last pose if it drifts
     calibration_correlations: FloatArray  # (c, c)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instant:
+    """The estimate at one stamp; covariances are None where the gains know none."""
+
+    stamp_ns: int
+    pose: FloatArray  # (4, 4) body to world
+    pose_covariance: FloatArray | None  # (6, 6) rotation vector, position; world, rad² and m²
+    ids: IntArray  # (n,)
+    world_points: FloatArray  # (n, 3) metres
+    landmark_covariances: FloatArray | None  # (n, 3, 3) world, m²
+    calibration: tuple[CalibrationEstimate, ...]
+    dropped: Counter[str]  # messages so far, by reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovations:
+    """All residuals of a run, one row each, and its u observations of known landmarks.
+
+    ``distances`` are in standard deviations; ``weights`` are 0 for what was gated and below 1 for
+    what was taken with caution; ``moved`` is what was taken to be somewhere else from then on.
+    """
+
+    stamps_ns: IntArray  # (m,)
+    ids: IntArray  # (m,)
+    distances: FloatArray  # (m,)
+    residuals: FloatArray  # (m, 3) metres, world
+    weights: FloatArray  # (m,)
+    moved: BoolArray  # (m,)
+    update_stamps_ns: IntArray  # (u,)
+    nis: FloatArray  # (u,) NaN where no joint covariance is known, or nothing was used
+    degrees_of_freedom: IntArray  # (u,)
+    lyapunov: FloatArray  # (u,)
+
+    @property
+    def residuals_m(self) -> FloatArray:
+        """(m,) lengths of the residuals, metres."""
+        lengths: FloatArray = np.linalg.norm(self.residuals, axis=1)
+        return lengths
+
+    @property
+    def mean_nis(self) -> float | None:
+        """NIS per degree of freedom over the run, 1 is consistent; None if none is known."""
+        total = int(self.degrees_of_freedom.sum())
+        return float(np.nansum(self.nis) / total) if total else None

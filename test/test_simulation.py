@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.evaluation.run_record import PoseTruth
+from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings.parameter_table import from_parameters

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.association.costs import NewLandmarks
+from slam_observer_ros.association.costs import NewLandmarks, RejectedLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     as_its_ids_say,
@@ -32,7 +32,6 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.slip import RejectedLandmarks
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
@@ -44,7 +43,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
-from slam_observer_ros.sensor_models.delay_evidence import DelayEvidence
+from slam_observer_ros.sensor_models.evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation

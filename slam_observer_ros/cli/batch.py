@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import logging
 import os
 from pathlib import Path
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.batch_index import INDEX, SCORES, write_index
 from slam_observer_ros.cli.batch_jobs import (
     find_recordings,
@@ -21,14 +22,12 @@ from slam_observer_ros.cli.batch_jobs import (
     opened_log,
     part_of,
     read_logs,
-    REPORTS,
     shard_of,
-    TRAJECTORIES,
-    Work,
     write_failures,
 )
 from slam_observer_ros.cli.batch_pool import cluster_pool, local_pool, Pool
 from slam_observer_ros.cli.console import (
+    kept_warnings,
     muted_warnings,
     print_json,
     print_table,
@@ -37,15 +36,63 @@ from slam_observer_ros.cli.console import (
 )
 from slam_observer_ros.cli.options import add_settings_options, named, named_path, read_given
 from slam_observer_ros.cli.outputs import check_directory
-from slam_observer_ros.cli.replay_request import add_run_options, read_request
-from slam_observer_ros.common.errors import IncompleteError, OutputError
+from slam_observer_ros.cli.replay import as_json, identity, summary_rows
+from slam_observer_ros.cli.replay_files import write_report_of
+from slam_observer_ros.cli.replay_outcome import with_logged
+from slam_observer_ros.cli.replay_request import add_run_options, read_request, Records
+from slam_observer_ros.cli.replay_run import replayed
+from slam_observer_ros.common.errors import IncompleteError, OutputError, UsageError
 from slam_observer_ros.common.files import destination
+from slam_observer_ros.evaluation.trajectory import write_tum
 from slam_observer_ros.recording.opening import sha256_of
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)
 
 Failure = dict[str, object]
+
+
+REPORTS, TRAJECTORIES = 'reports', 'trajectories'
+"""Folders of ``--out`` for files of the runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Does the jobs of a batch, and writes those files of each that are asked for."""
+
+    out: Path
+    writes_reports: bool
+    writes_trajectories: bool
+    version: str = __version__
+
+    def __call__(self, job: Job) -> dict[str, object]:
+        """Do a run, write its files, and return its line of the log."""
+        if self.version != __version__:
+            raise UsageError(f'this worker has version {__version__}, the batch {self.version}')
+        report = self._file(REPORTS, job, '.html') if self.writes_reports else None
+        tum = self._file(TRAJECTORIES, job, '.tum') if self.writes_trajectories else None
+        records = Records(poses=tum is not None, whole_run=report is not None)
+        with kept_warnings() as warnings:
+            outcome, _ = replayed(replace(job.request, records=records), shows_progress=False)
+        outcome = with_logged(outcome, warnings)
+        if tum is not None:
+            write_tum(outcome.trajectory, tum)
+        if report is not None:
+            write_report_of(job.file_stem, outcome, summary_rows(outcome), report)
+        return {
+            'run': job.run_id,
+            'grid': job.point,
+            'report': self._relative(report),
+            'trajectory': self._relative(tum),
+            **identity(job.recording, job.recording_sha256, outcome),
+            **as_json(outcome),
+        }
+
+    def _file(self, folder: str, job: Job, suffix: str) -> Path:
+        return self.out / folder / f'{job.file_stem}{suffix}'
+
+    def _relative(self, file: Path | None) -> str | None:
+        return None if file is None else file.relative_to(self.out).as_posix()
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""What a batch is to run, every recording with every setting, and what is done of it.
+"""What a batch is to run, every recording with every setting, and the log of what is done.
 
 A run that is done is a JSON line, appended when it is finished and never changed. Each shard has a
 file of its own, so that no two programs write to one; what one reads is all of them.
@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import fcntl
 import glob
 import hashlib
@@ -25,17 +25,11 @@ import sys
 from typing import Any
 
 from slam_observer_ros import __version__
-from slam_observer_ros.cli.console import kept_warnings
 from slam_observer_ros.cli.options import parse_value
-from slam_observer_ros.cli.replay_files import write_report_of
-from slam_observer_ros.cli.replay_outcome import with_logged
-from slam_observer_ros.cli.replay_request import Records, ReplayRequest
-from slam_observer_ros.cli.replay_run import replayed
-from slam_observer_ros.cli.replay_summary import as_json, identity, summary_rows
+from slam_observer_ros.cli.replay_request import ReplayRequest
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError, shown, UsageError
 from slam_observer_ros.common.files import not_special, unfinished_file
-from slam_observer_ros.evaluation.trajectory import write_tum
 from slam_observer_ros.known_map.map_file import map_files
 from slam_observer_ros.runs.accuracy import FIGURES
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -150,49 +144,6 @@ def _changed(settings: Settings | InputSettings) -> dict[str, object]:
 
 def _sha256_of_bytes(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-REPORTS, TRAJECTORIES = 'reports', 'trajectories'
-"""Folders of ``--out`` for files of the runs."""
-
-
-@dataclass(frozen=True, slots=True)
-class Work:
-    """Does the jobs of a batch, and writes those files of each that are asked for."""
-
-    out: Path
-    writes_reports: bool
-    writes_trajectories: bool
-    version: str = __version__
-
-    def __call__(self, job: Job) -> dict[str, object]:
-        """Do a run, write its files, and return its line of the log."""
-        if self.version != __version__:
-            raise UsageError(f'this worker has version {__version__}, the batch {self.version}')
-        report = self._file(REPORTS, job, '.html') if self.writes_reports else None
-        tum = self._file(TRAJECTORIES, job, '.tum') if self.writes_trajectories else None
-        records = Records(poses=tum is not None, whole_run=report is not None)
-        with kept_warnings() as warnings:
-            outcome, _ = replayed(replace(job.request, records=records), shows_progress=False)
-        outcome = with_logged(outcome, warnings)
-        if tum is not None:
-            write_tum(outcome.trajectory, tum)
-        if report is not None:
-            write_report_of(job.file_stem, outcome, summary_rows(outcome), report)
-        return {
-            'run': job.run_id,
-            'grid': job.point,
-            'report': self._relative(report),
-            'trajectory': self._relative(tum),
-            **identity(job.recording, job.recording_sha256, outcome),
-            **as_json(outcome),
-        }
-
-    def _file(self, folder: str, job: Job, suffix: str) -> Path:
-        return self.out / folder / f'{job.file_stem}{suffix}'
-
-    def _relative(self, file: Path | None) -> str | None:
-        return None if file is None else file.relative_to(self.out).as_posix()
 
 
 Line = dict[str, Any]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 
 from slam_observer_ros import __version__
 from slam_observer_ros.cli.calibration_finder import Finder, growth
@@ -29,12 +28,12 @@ from slam_observer_ros.cli.console import (
 from slam_observer_ros.cli.held_out import (
     add_material_options,
     check_improvement,
-    check_seen,
     HELD_OUT_SHARE,
     judge,
-    Judged,
+    judged_by,
     judged_lines,
     Material,
+    read_held_out,
     read_material,
     Verdict,
     verdict_lines,
@@ -45,16 +44,13 @@ from slam_observer_ros.cli.outputs import (
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
-from slam_observer_ros.cli.replay_run import select_inputs
+from slam_observer_ros.cli.replay_request import read_request, ReplayRequest, select_inputs
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.runs.health import of_mounting, of_noise
-from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import write_found
 
 
@@ -109,9 +105,16 @@ def run(args: argparse.Namespace) -> None:
         noisy = with_noise(stated, found, not _states_motion(material))
         corrected = replace(request, inputs=stated.inputs)
         trained_on = read_material(corrected, share, survey)
-        others = _held_out(request, corrected, args.hold_out, survey)
-        held_out = others if args.hold_out else [(material, trained_on)]
-        stated, verdict = _judged(request.settings, stated, noisy, held_out)
+        held_out: Iterable[Sequence[Material]] = [(material, trained_on)]
+        if args.hold_out:
+            held_out = read_held_out((request, corrected), args.hold_out, survey)
+        before, after, after_noise = judged_by(
+            [request.settings, stated.settings, noisy.settings],
+            ((as_given, as_found, as_found) for as_given, as_found in held_out),
+        )
+        if not judge(after, after_noise).objection:  # else the noise is left as it was
+            stated, after = noisy, after_noise
+        verdict = judge(before, after)
         gain = growth(
             material.likelihood(request.settings), trained_on.likelihood(stated.settings)
         )
@@ -130,18 +133,6 @@ def _sensor_pose(request: ReplayRequest, found: Found) -> FloatArray | None:
         return recording.sensor_pose(selected, inputs, next(iter(found.frames)))
 
 
-def _held_out(
-    request: ReplayRequest,
-    corrected: ReplayRequest,
-    paths: Sequence[Path],
-    survey: LandmarkMap | None,
-) -> Iterator[tuple[Material, Material]]:
-    """Read what is held out, one recording after the other, as two requests have it."""
-    for path in paths:
-        before, after = (replace(one, recording=path) for one in (request, corrected))
-        yield read_material(before, 1.0, survey), read_material(after, 1.0, survey)
-
-
 def _states_motion(material: Material) -> bool:
     """Return whether some velocities come with their covariances."""
     return any(
@@ -149,29 +140,6 @@ def _states_motion(material: Material) -> bool:
         for event in material.events
         if isinstance(event, VelocityEvent)
     )
-
-
-def _judged(
-    settings: Settings,
-    stated: Stated,
-    noisy: Stated,
-    held_out: Iterable[tuple[Material, Material]],
-) -> tuple[Stated, Verdict]:
-    """Judge on what was held out, as it was and with the sensor where it was found to be.
-
-    The noise is left as it was if that is no improvement.
-    """
-    before: list[Judged] = []
-    after: list[Judged] = []
-    after_noise: list[Judged] = []
-    for given, corrected in held_out:
-        before.append(given.judged(settings))
-        after.append(corrected.judged(stated.settings))
-        after_noise.append(corrected.judged(noisy.settings))
-    check_seen([*before, *after, *after_noise])
-    if not judge(after, after_noise).objection:
-        stated, after = noisy, after_noise
-    return stated, judge(before, after)
 
 
 def _print(

@@ -12,14 +12,15 @@ import re
 from slam_observer_ros.cli.console import print_columns, print_json
 from slam_observer_ros.cli.options import add_settings_options, named, named_path, read_given
 from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
+from slam_observer_ros.cli.replay import as_json, NEARLY_ALL
 from slam_observer_ros.cli.replay_request import (
     add_run_options,
     read_request,
     Records,
     ReplayRequest,
+    select_inputs,
 )
-from slam_observer_ros.cli.replay_run import replayed, select_inputs
-from slam_observer_ros.cli.replay_summary import as_json, NEARLY_ALL
+from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.evaluation.drawing import SUFFIXES
 from slam_observer_ros.evaluation.map_plot import plot_overlay

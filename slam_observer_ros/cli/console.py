@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.findings import Finding
-from slam_observer_ros.common.signals import leaving_at_once
+from slam_observer_ros.common.process import leaving_at_once
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
@@ -12,8 +12,7 @@ import numpy as np
 
 from slam_observer_ros.cli.options import add_settings_options, named_path
 from slam_observer_ros.cli.outputs import add_force_option
-from slam_observer_ros.cli.replay_request import add_input_options, ReplayRequest
-from slam_observer_ros.cli.replay_run import select_inputs
+from slam_observer_ros.cli.replay_request import add_input_options, ReplayRequest, select_inputs
 from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
@@ -23,7 +22,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.opening import sha256_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
-from slam_observer_ros.runs.likelihood import Likelihood, LikelihoodRecorder
+from slam_observer_ros.runs.accuracy import Likelihood, LikelihoodRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -232,10 +231,34 @@ def read_material(
     return Material(path, digest, events, truth, reach_m, split_ns, landmark_map)
 
 
-def check_seen(judged: Iterable[Judged]) -> None:
-    """Raise a UsageError if there is nothing to judge in what was held out."""
-    if not all(len(one.likelihood.stamps_ns) for one in judged):
+def read_held_out(
+    requests: Sequence[ReplayRequest],
+    paths: Iterable[Path],
+    landmark_map: LandmarkMap | None = None,
+) -> Iterator[list[Material]]:
+    """Read recordings that are held out, one after the other, each as all requests have it."""
+    for path in paths:
+        yield [
+            read_material(replace(request, recording=path), 1.0, landmark_map)
+            for request in requests
+        ]
+
+
+def judged_by(
+    settings: Sequence[Settings], held_out: Iterable[Sequence[Material]]
+) -> list[list[Judged]]:
+    """Return how each of some settings does on all recordings, in their order.
+
+    Of each recording ``held_out`` has what is read for each of the settings. Raises a UsageError
+    if there is nothing to judge.
+    """
+    rows = [
+        [material.judged(one) for one, material in zip(settings, materials, strict=True)]
+        for materials in held_out
+    ]
+    if not all(len(judged.likelihood.stamps_ns) for row in rows for judged in row):
         raise UsageError('nothing is seen twice in what is held out')
+    return [list(column) for column in zip(*rows, strict=True)]
 
 
 def check_improvement(verdict: Verdict) -> None:

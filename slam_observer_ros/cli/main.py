@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slam_observer_ros.common.signals import leaving_at_once, SIGNALLED, stopping_once
+from slam_observer_ros.common.process import leaving_at_once, SIGNALLED, stopping_once
 
 with leaving_at_once():
     import argparse
@@ -25,13 +25,13 @@ with leaving_at_once():
         show_message,
         typed_words,
     )
-    from slam_observer_ros.common.computing import use_one_thread
     from slam_observer_ros.common.errors import (
         IncompleteError,
         LossError,
         message_of,
         SlamObserverError,
     )
+    from slam_observer_ros.common.process import use_one_thread
     from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2

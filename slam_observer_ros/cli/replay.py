@@ -1,10 +1,13 @@
-"""``slam-observer replay``: a recording through the estimator."""
+"""``slam-observer replay``: a recording through the estimator, and what is printed of it."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from collections import Counter
+from dataclasses import asdict, replace
+from pathlib import Path
 
+from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import kept_warnings, print_json, print_table
 from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
 from slam_observer_ros.cli.outputs import add_force_option
@@ -17,10 +20,15 @@ from slam_observer_ros.cli.replay_files import (
 from slam_observer_ros.cli.replay_outcome import ReplayOutcome, with_logged
 from slam_observer_ros.cli.replay_request import add_run_options, read_request, warn_of_unused
 from slam_observer_ros.cli.replay_run import replayed
-from slam_observer_ros.cli.replay_summary import as_json, identity, summary_rows
 from slam_observer_ros.common.errors import LossError, OutputError
+from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
+from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.opening import sha256_of
+from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, figure_text
+from slam_observer_ros.runs.input_health import list_dropped
+from slam_observer_ros.runs.replay import Replay
 from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.parameter_table import changed_names
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -75,3 +83,159 @@ def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame
         raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')
     if args.strict and outcome.unused_input:
         raise LossError(f'{args.recording}: --strict does not allow this: {outcome.unused_input}')
+
+
+NEARLY_ALL = 0.99
+"""Share of the trajectory that the truth covers, up to which it is printed."""
+
+LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported', 'doubled')
+"""What may happen to landmarks of the map; counted under these names."""
+
+
+def identity(recording: Path, sha256: str, outcome: ReplayOutcome) -> dict[str, object]:
+    """Return what was replayed, by what, as ``--json`` has it first."""
+    settings = outcome.result.estimator.settings
+    return {
+        'recording': str(recording),
+        'recording_sha256': sha256,
+        'version': __version__,
+        'settings': {name: getattr(settings, name) for name in changed_names(settings)},
+        'warnings': list(outcome.warnings),
+    }
+
+
+def as_json(outcome: ReplayOutcome) -> dict[str, object]:
+    """Return the figures as ``--json`` prints them; null is what was not measured."""
+    estimator, accuracy = outcome.result.estimator, outcome.accuracy
+    errors, after = accuracy.pose_errors, outcome.smoothed_accuracy
+    selected = outcome.selected
+    return {
+        'velocity_topic': selected.velocity.name,
+        'landmarks_topic': selected.landmarks.name,
+        'imu_topic': None if selected.imu is None else selected.imu.name,
+        'gains': estimator.settings.gains,
+        'events': outcome.events,
+        'duration_s': outcome.duration_s,
+        'seconds': outcome.result.seconds,
+        'landmarks': len(estimator.landmark_ids),
+        'dropped': outcome.dropped,
+        'lost': outcome.lost,
+        'findings': [finding.as_json() for finding in outcome.findings],
+        'used': dict(estimator.counts),
+        'calibration': {part.name: asdict(part) for part in estimator.calibration},
+        'motion_factors': {part.name: asdict(part) for part in estimator.motion_factors},
+        'map': estimator.map_name or None,
+        'localised_after_s': outcome.localised_after_s,
+        'truth_covered': outcome.truth_covered,
+        'ate_rmse_m': _ate_rmse_m(errors),
+        'unaligned_rmse_m': outcome.unaligned_rmse_m,
+        'rotation_rmse_rad': None if errors is None else errors.rotation_rmse_rad,
+        'heading_rmse_rad': None if errors is None else errors.heading_rmse_rad,
+        'landmark_rmse_m': accuracy.landmark_rmse_m,
+        'configuration_rmse_m': accuracy.configuration_rmse_m,
+        'anees': accuracy.anees,
+        'configuration_anees': accuracy.configuration_anees,
+        'nis': None if outcome.recorder is None else outcome.recorder.mean_nis,
+        'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
+        'unsmoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.online_errors),
+        'smoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.pose_errors),
+        'smoothed_landmark_rmse_m': None if after is None else after.landmark_rmse_m,
+        'smoothed_slips': None if outcome.smoothed is None else outcome.smoothed.slips,
+    }
+
+
+def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
+    return None if errors is None else errors.ate_rmse_m
+
+
+def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
+    """Return the figures as text, by their names."""
+    selected = outcome.selected
+    estimator = outcome.result.estimator
+    note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
+    rows = {'used': outcome.unused_input} if outcome.unused_input else {}
+    rows |= {
+        'velocity topic': str(selected.velocity),
+        'landmarks topic': f'{selected.landmarks}{note}',
+        **({} if selected.imu is None else {'Imu topic': str(selected.imu)}),
+        'events': f'{outcome.events} over {outcome.duration_s:.1f} s',
+        'estimator': f'{estimator.settings.gains} gains, '
+        f'{outcome.result.seconds:.2f} s of CPU time',
+        'landmarks': _landmarks_text(len(estimator.landmark_ids), estimator.counts),
+        'observed points': _points_text(estimator.counts),
+        'dropped': list_dropped(outcome.dropped),
+    }
+    if outcome.loss or outcome.lost['malformed']:
+        rows['lost'] = _loss_text(outcome)
+    if slips := estimator.counts['slip']:
+        rows['slips'] = f'{slips} × the robot was not where odometry had it'
+        if outcome.smoothed is not None:
+            rows['slips'] += f'; all that was seen confirms {outcome.smoothed.slips}'
+    if unexpected := estimator.counts['unexpected_place']:
+        rows['unexpected places'] = f'{unexpected} × nothing seen was where the map has it'
+    if outcome.localised_after_s is not None:
+        rows['pose in the map'] = _localisation_text(outcome.result, outcome.localised_after_s)
+    rows |= {part.name: str(part) for part in estimator.calibration}
+    rows |= {f'noise of {part.name}': str(part) for part in estimator.motion_factors}
+    return rows | _accuracy_rows(outcome)
+
+
+def _loss_text(outcome: ReplayOutcome) -> str:
+    parts = []
+    if outcome.loss:
+        parts.append(str(outcome.loss))
+    if malformed := outcome.lost['malformed']:
+        parts.append(f'{malformed} malformed messages')
+    return ', '.join(parts)
+
+
+def _localisation_text(result: Replay, localised_after_s: float) -> str:
+    name = f' in {result.estimator.map_name}' if result.estimator.map_name else ''
+    found = f'found after {localised_after_s:.1f} s{name}, where the trajectory begins'
+    if result.estimator.settings.set_initial_pose and localised_after_s == 0.0:
+        found = f'given at the start{name}'
+    lost = result.estimator.counts['lost']
+    return f'{found}; lost {lost} × and searched again' if lost else found
+
+
+def _landmarks_text(landmarks: int, counts: Counter[str]) -> str:
+    changed = {change: counts[f'{change}_landmark'] for change in LANDMARK_CHANGES}
+    changes = [f'{count} {change}' for change, count in changed.items() if count]
+    return ', '.join([str(landmarks), *changes])
+
+
+def _points_text(counts: Counter[str]) -> str:
+    """Say how many points were used, and why the others were not."""
+    parts = [f'{used_points(counts)} used']
+    parts += [
+        f'{counts[name]} {reason} ({100.0 * point_share(counts, name):.1f} %)'
+        for name, reason in UNUSED_POINTS.items()
+        if counts[name]
+    ]
+    return ', '.join(parts)
+
+
+def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
+    """Say of how much of the trajectory the figures are, if not of nearly all."""
+    share = outcome.truth_covered
+    if share is None or share > NEARLY_ALL:
+        return {}
+    return {'truth': f'covers {100.0 * share:.1f} % of the trajectory'}
+
+
+def _accuracy_rows(outcome: ReplayOutcome) -> dict[str, str]:
+    figures = as_json(outcome)
+    if figures['unsmoothed_ate_rmse_m'] == figures['ate_rmse_m']:  # all of it is smoothed
+        figures['unsmoothed_ate_rmse_m'] = None
+    rows = _covered_rows(outcome) | {
+        name: figure_text(key, figure, unit)
+        for key, (name, unit) in ACCURACY_ROWS.items()
+        if isinstance(figure := figures[key], float)
+    }
+    if rows:
+        return rows
+    has_truth = len(outcome.truth.stamps_ns) > 0 or outcome.truth.landmarks is not None
+    why = 'the truth fits nothing estimated'
+    if not has_truth:
+        why = 'the recording holds no truth to compare with'
+    return {'accuracy': f'not known: {why}'}

@@ -13,8 +13,11 @@ import numpy as np
 
 from slam_observer_ros.cli.options import Given, named, named_path, settings_of
 from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.observer.designs import make_gains
-from slam_observer_ros.recording.topics import TopicNames
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.recording.topics import SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings, short_names
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -196,3 +199,44 @@ def warn_of_unused(args: argparse.Namespace, given: Given) -> None:
     ]
     if unused:
         logger.warning('Not used of --config: %s.', ', '.join(unused))
+
+
+def select_inputs(
+    request: ReplayRequest, recording: Recording
+) -> tuple[SelectedTopics, InputSettings, Truth]:
+    """Return the topics to be read, the settings with the frames of these, and the truth."""
+    if recording.warning:
+        logger.warning('%s', found('incomplete_recording', problem=recording.warning))
+    selected = recording.find_topics(request.topics, request.inputs)
+    inputs = _with_base_frame(request.inputs, recording, selected)
+    _check_frames(inputs)
+    truth = recording.truth(selected, inputs.base_frame)
+    return selected, inputs, truth.flattened() if request.settings.two_d_mode else truth
+
+
+def _with_base_frame(
+    inputs: InputSettings, recording: Recording, selected: SelectedTopics
+) -> InputSettings:
+    """Name the base frame, if the user doesn't: that of the velocities.
+
+    If they name none it is the node's, if /tf has that; else, with a warning, the landmarks'.
+    """
+    if inputs.base_frame:
+        return inputs
+    world, default = ('', inputs.map_frame, inputs.odom_frame), InputSettings().base_frame
+    velocity_frame, base_frame = recording.contents.frames(selected, inputs)
+    base_frame = inputs.sensor_frame or base_frame
+    if velocity_frame not in world:
+        base_frame = velocity_frame
+    elif base_frame not in (*world, default):
+        if recording.contents.has_transform_of(default, selected):
+            base_frame = default
+        else:
+            logger.warning('%s', found('guessed_base', frame=base_frame))
+    return replace(inputs, base_frame='' if base_frame in world else base_frame)
+
+
+def _check_frames(inputs: InputSettings) -> None:
+    """Raise a ParameterError if the node refuses these frames; an unnamed base has its default."""
+    base_frame = inputs.base_frame or InputSettings().base_frame
+    replace(inputs, base_frame=base_frame).check_frames_differ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 import logging
 from typing import TYPE_CHECKING
 
@@ -12,14 +11,13 @@ import numpy as np
 
 from slam_observer_ros.cli.console import show_progress
 from slam_observer_ros.cli.replay_outcome import judged, outcome_of, ReplayOutcome, with_smoothed
-from slam_observer_ros.cli.replay_request import Records, ReplayRequest
+from slam_observer_ros.cli.replay_request import Records, ReplayRequest, select_inputs
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.common.findings import Finding, found
+from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.input_health import of_use
 from slam_observer_ros.runs.replay import Replay, replay
@@ -51,19 +49,6 @@ def replayed(request: ReplayRequest, *, shows_progress: bool = True) -> tuple[Re
         maps = read_maps(request.load_map)
     outcome = _replay(request, maps, shows_progress)
     return outcome, _frame_of_outputs(request.inputs, maps)
-
-
-def select_inputs(
-    request: ReplayRequest, recording: Recording
-) -> tuple[SelectedTopics, InputSettings, Truth]:
-    """Return the topics to be read, the settings with the frames of these, and the truth."""
-    if recording.warning:
-        logger.warning('%s', found('incomplete_recording', problem=recording.warning))
-    selected = recording.find_topics(request.topics, request.inputs)
-    inputs = _with_base_frame(request.inputs, recording, selected)
-    _check_frames(inputs)
-    truth = recording.truth(selected, inputs.base_frame)
-    return selected, inputs, truth.flattened() if request.settings.two_d_mode else truth
 
 
 def _replay(
@@ -110,34 +95,6 @@ def _frame_of_outputs(inputs: InputSettings, maps: Sequence[LandmarkMap]) -> str
         maps[0].frame_id,
     )
     return maps[0].frame_id
-
-
-def _with_base_frame(
-    inputs: InputSettings, recording: Recording, selected: SelectedTopics
-) -> InputSettings:
-    """Name the base frame, if the user doesn't: that of the velocities.
-
-    If they name none it is the node's, if /tf has that; else, with a warning, the landmarks'.
-    """
-    if inputs.base_frame:
-        return inputs
-    world, default = ('', inputs.map_frame, inputs.odom_frame), InputSettings().base_frame
-    velocity_frame, base_frame = recording.contents.frames(selected, inputs)
-    base_frame = inputs.sensor_frame or base_frame
-    if velocity_frame not in world:
-        base_frame = velocity_frame
-    elif base_frame not in (*world, default):
-        if recording.contents.has_transform_of(default, selected):
-            base_frame = default
-        else:
-            logger.warning('%s', found('guessed_base', frame=base_frame))
-    return replace(inputs, base_frame='' if base_frame in world else base_frame)
-
-
-def _check_frames(inputs: InputSettings) -> None:
-    """Raise a ParameterError if the node refuses these frames; an unnamed base has its default."""
-    base_frame = inputs.base_frame or InputSettings().base_frame
-    replace(inputs, base_frame=base_frame).check_frames_differ()
 
 
 def _check_used(request: ReplayRequest, use: list[Finding]) -> None:

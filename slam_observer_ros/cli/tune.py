@@ -12,12 +12,12 @@ from slam_observer_ros.cli.console import muted_warnings, print_json, print_tabl
 from slam_observer_ros.cli.held_out import (
     add_material_options,
     check_improvement,
-    check_seen,
     HELD_OUT_SHARE,
     judge,
-    Judged,
+    judged_by,
     judged_lines,
     Material,
+    read_held_out,
     read_material,
     Verdict,
     verdict_lines,
@@ -36,7 +36,7 @@ from slam_observer_ros.cli.outputs import (
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay_request import read_request, ReplayRequest
+from slam_observer_ros.cli.replay_request import read_request
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -83,7 +83,9 @@ def run(args: argparse.Namespace) -> None:
     if not kinds:
         raise UsageError('no noise figure has an effect: messages state all covariances')
     tuned = _rounded(scaled(settings, kinds, found.log_factors.tolist()), kinds)
-    verdict = _verdict(request, args.hold_out, trained_on, tuned)
+    held_out = read_held_out([request], args.hold_out) if args.hold_out else zip(trained_on)
+    before, after = judged_by([settings, tuned], ([one, one] for (one,) in held_out))
+    verdict = judge(before, after)
     _print(args, settings, tuned, kinds, found, verdict)
     check_improvement(verdict)
     if args.out is not None:
@@ -95,27 +97,6 @@ def _rounded(settings: Settings, kinds: Sequence[NoiseKind]) -> Settings:
     """Return settings as they are written to a file."""
     values = {name: rounded(getattr(settings, name)) for kind in kinds for name in kind.parameters}
     return Settings(**asdict(settings) | values)
-
-
-def _verdict(
-    request: ReplayRequest,
-    held_out: Sequence[Path],
-    trained_on: Sequence[Material],
-    tuned: Settings,
-) -> Verdict:
-    """Compare the settings on what was held out, one recording after the other."""
-    before: list[Judged] = []
-    after: list[Judged] = []
-    for number in range(len(held_out) or len(trained_on)):
-        material = (
-            read_material(replace(request, recording=held_out[number]), 1.0)
-            if held_out
-            else trained_on[number]
-        )
-        before.append(material.judged(request.settings))
-        after.append(material.judged(tuned))
-    check_seen([*before, *after])
-    return judge(before, after)
 
 
 def _head(trained_on: Sequence[Material], held_out: Sequence[Path], verdict: Verdict) -> list[str]:

@@ -34,8 +34,7 @@ from slam_observer_ros.evaluation.drawing import (
     TRUE_PATH,
 )
 from slam_observer_ros.evaluation.metrics import trajectory_errors
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, Trajectory
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 

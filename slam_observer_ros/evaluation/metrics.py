@@ -14,10 +14,10 @@ import numpy as np
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
 from slam_observer_ros.evaluation.trajectory import (
     associate,
     is_sparse,
+    LandmarkTruth,
     MAX_GAP_NS,
     Trajectory,
 )

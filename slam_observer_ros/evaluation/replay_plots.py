@@ -14,6 +14,7 @@ import numpy as np
 from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import Innovations
 from slam_observer_ros.evaluation.consistency import average_nees_band, NeesOverTime
 from slam_observer_ros.evaluation.drawing import (
     BLACK,
@@ -29,7 +30,6 @@ from slam_observer_ros.evaluation.drawing import (
     STYLE,
 )
 from slam_observer_ros.evaluation.metrics import ConfigurationError, TrajectoryErrors
-from slam_observer_ros.evaluation.run_record import Innovations
 from slam_observer_ros.settings.estimator_settings import Settings
 
 _LEAST_NEES = 1e-3

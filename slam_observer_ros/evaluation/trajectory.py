@@ -1,4 +1,4 @@
-"""Time-stamped poses: interpolation of the truth, and TUM files."""
+"""What is true of poses and landmarks; poses over time: their interpolation, and TUM files."""
 
 from __future__ import annotations
 
@@ -23,6 +23,22 @@ _MAX_STAMP = 2**63
 """Nanoseconds; as seconds, the year 2262 is not reached."""
 
 _TUM_HEADER = '# timestamp[s] x y z [m] qx qy qz qw\n'
+
+
+@dataclass(frozen=True, slots=True)
+class PoseTruth:
+    """True pose (4, 4) of the robot, base frame to world, at a time."""
+
+    stamp_ns: int
+    pose: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkTruth:
+    """True positions (n, 3) of landmarks, in the world, metres, and their ids (n,)."""
+
+    ids: IntArray
+    world_points: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -18,7 +20,7 @@ class EstimatedAxes:
     point : int
         Leading axes of a point, 2 or 3.
     turn, turned : int, IntArray
-        Leading axes of ε that are turns, 1 or 3, and which: about z, or about all.
+        How many turns of a landmark are estimated, 1 or 3, and which: about z, or about all.
 
     """
 
@@ -33,6 +35,12 @@ class EstimatedAxes:
         turns = np.concatenate([-so3.hat(np.eye(3)), np.zeros((3, 3, 3))], axis=2)
         self._turns = turns[:, :point, pose].reshape(3, -1)
         self._shift = np.eye(3, 6, 3)[:point, pose].ravel()
+
+    def of_points(self) -> EstimatedAxes:
+        """Return the same where landmarks have no orientations: ``turn`` is 0."""
+        other = copy(self)
+        other.turn, other.turned, other._turned = 0, self.turned[:0], slice(0)
+        return other
 
     def output_matrix(self, lever_arms: FloatArray) -> FloatArray:
         """Return (m, point, p) blocks [−[y]×, I]: how a pose error ε moves points y (m, 3)."""

@@ -31,14 +31,16 @@ import yaml
 
 from slam_observer_ros import __version__
 from slam_observer_ros.common.errors import MapError, shown, YamlError
-from slam_observer_ros.common.files import destination, keep_copy, unfinished_file
-from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.yaml_files import (
+from slam_observer_ros.common.files import (
     constructed,
+    destination,
     FAST_LOADER,
+    keep_copy,
     load_yaml,
     plain_value,
+    unfinished_file,
 )
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import are_covariances

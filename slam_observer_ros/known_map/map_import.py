@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from slam_observer_ros.common.errors import MapError, shown, YamlError
-from slam_observer_ros.common.files import read_text
+from slam_observer_ros.common.files import load_yaml, plain_value, read_text
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap

@@ -1,9 +1,9 @@
 """ROS 2 nodes; the only part of the package that needs rclpy and message packages.
 
-``executables`` wait for signals from the first instant (``common/signals``), then load a node and
+``executables`` wait for signals from the first instant (``common/process``), then load a node and
 give it to ``runner``. ``observer_nodes`` has the observer, plain and managed: shells around
 ``observer_core``, where what comes in (``intake/``) goes through the estimator to what goes out
-(``publishing/``), and ``services/`` steer it. ``simulator`` is the paper's simulation.
-Used by all: ``guarded_node`` (what callbacks raise and nodes log, and what a managed node
-destroys again), ``ros_parameters`` and ``message_classes``.
+(``publishing/``); ``control_services``, ``map_services`` and ``initial_pose`` steer it.
+``simulator`` is the paper's simulation. Used by all: ``guarded_node`` (what callbacks raise and
+nodes log, and what a managed node destroys again), ``ros_parameters`` and ``message_classes``.
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import sys
 
-from slam_observer_ros.common.signals import StopSignal
+from slam_observer_ros.common.process import StopSignal
 
 
 def observer_node() -> int:
@@ -37,7 +37,7 @@ def simulator_node() -> int:
 
 def _begin() -> StopSignal:
     stop = StopSignal()  # before all else: what a node imports takes seconds
-    from slam_observer_ros.common.computing import use_one_thread
+    from slam_observer_ros.common.process import use_one_thread
 
     use_one_thread()
     return stop

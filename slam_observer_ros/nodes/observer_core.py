@@ -8,15 +8,15 @@ from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
+from slam_observer_ros.nodes.control_services import ControlServices
 from slam_observer_ros.nodes.data_flow import DataFlow
 from slam_observer_ros.nodes.guarded_node import Entities, GuardedNode, ThrottledLog
+from slam_observer_ros.nodes.initial_pose import InitialPoseListener, KeptPose
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
+from slam_observer_ros.nodes.map_services import MapServices, NamedMapServices
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
 from slam_observer_ros.nodes.ros_parameters import read_settings
-from slam_observer_ros.nodes.services.control_services import ControlServices
-from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener, KeptPose
-from slam_observer_ros.nodes.services.map_services import MapServices, NamedMapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names

@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.common.signals import StopSignal
+from slam_observer_ros.common.process import StopSignal
 
 try:
     from rclpy.experimental.events_executor import EventsExecutor

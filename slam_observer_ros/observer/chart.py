@@ -48,37 +48,36 @@ class Step(NamedTuple):
 class Chart:
     """Columns of P: ``robot`` = p + c of ε and c̃, then from ``first`` on ``stride`` a landmark.
 
-    ``turn`` = q of these are of ω_i where orientations are estimated, ``velocity`` = k of ũ_i
-    where velocities are; else 0. Before ``first`` there may be ``postponed`` ones, of what no
-    motion and no view acts on: see :mod:`.compressed_covariance`.
+    ``turn`` = q of these are of ω_i, 0 of ``axes`` without turns, ``velocity`` = k of ũ_i where
+    velocities are estimated; else 0. Before ``first`` there may be ``postponed`` ones, of what no
+    motion and no view acts on: see :class:`.CompressedCovariance`.
     """
 
     def __init__(
         self,
         axes: EstimatedAxes,
         calibrated: int,
-        turn: int = 0,
         velocity: int = 0,
         postponed: int = 0,
     ) -> None:
-        self.axes, self.turn, self.velocity = axes, turn, velocity
+        self.axes, self.turn, self.velocity = axes, axes.turn, velocity
         self.robot = axes.p + calibrated
         self.first = self.robot + postponed
-        self.stride = axes.point + turn + velocity
+        self.stride = axes.point + axes.turn + velocity
         self._points = self.first + np.arange(axes.point)
-        self._turns = self.first + axes.point + np.arange(turn)
-        self._velocities = self.first + axes.point + turn + np.arange(velocity)
-        self._turned = np.eye(turn, axes.p)
+        self._turns = self.first + axes.point + np.arange(axes.turn)
+        self._velocities = self.first + axes.point + axes.turn + np.arange(velocity)
+        self._turned = np.eye(axes.turn, axes.p)
 
     def with_calibration(self, count: int) -> Chart:
         """Return the chart with so many more entries in c̃."""
         calibrated = self.robot - self.axes.p + count
-        return Chart(self.axes, calibrated, self.turn, self.velocity)
+        return Chart(self.axes, calibrated, self.velocity)
 
     def with_postponed(self, count: int) -> Chart:
         """Return the chart with so many postponed columns."""
         calibrated = self.robot - self.axes.p
-        return Chart(self.axes, calibrated, self.turn, self.velocity, count)
+        return Chart(self.axes, calibrated, self.velocity, count)
 
     # Where in x
 

@@ -19,7 +19,7 @@ from slam_observer_ros.common.errors import DataSetError, shown
 from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth
 from slam_observer_ros.events import MAX_ID, ObservationEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.writer import DataSet

@@ -13,11 +13,9 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from slam_observer_ros.common.errors import message_of, RecordingError, YamlError
-from slam_observer_ros.common.files import not_special
-from slam_observer_ros.common.yaml_files import load_yaml, plain_value
+from slam_observer_ros.common.files import load_yaml, not_special, plain_value
 from slam_observer_ros.recording.mcap_source import McapSource
 from slam_observer_ros.recording.sources import (
-    BagSource,
     Loss,
     MessageSource,
     RawMessage,
@@ -196,7 +194,8 @@ def _open_mcap(path: Path) -> tuple[MessageSource, str | None]:
 
 
 def _open_bag(path: Path) -> tuple[MessageSource, str | None]:
-    from slam_observer_ros.recording.salvage import MendedSource  # which MCAP files do without
+    # MCAP files do without these.
+    from slam_observer_ros.recording.bag_source import BagSource, MendedSource
 
     try:
         return MendedSource(BagSource(path), lambda: _salvaged(path)), None
@@ -208,7 +207,7 @@ def _open_bag(path: Path) -> tuple[MessageSource, str | None]:
 
 
 def _salvaged(path: Path) -> MessageSource:
-    from slam_observer_ros.recording.salvage import SalvagedSource
+    from slam_observer_ros.recording.bag_source import SalvagedSource
     from slam_observer_ros.recording.salvage_formats import SCANS  # which few files need
 
     return SalvagedSource(path, SCANS[path.suffix])

@@ -14,7 +14,7 @@ import numpy as np
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth
 from slam_observer_ros.events import IMPOSSIBLE_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.messages.poses import PoseBlock

@@ -11,7 +11,7 @@ from typing import Final
 import lz4.frame  # type: ignore[import-untyped]
 
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.recording.salvage import (
+from slam_observer_ros.recording.bag_source import (
     Damaged,
     Found,
     FoundChannel,

@@ -1,4 +1,4 @@
-"""Serialised messages out of whole MCAP, rosbag2 and ROS 1 files."""
+"""Serialised messages out of recordings: what every source gives, and several parts of one."""
 
 from __future__ import annotations
 
@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.recording.definitions import Ros1Messages
 
 if TYPE_CHECKING:
-    from rosbags import rosbag1, rosbag2
-    from rosbags.interfaces import Connection
+    pass
 
 
 MOST_IN_BLOCK = 4096
@@ -177,63 +175,6 @@ class MessageSource(ABC):
 
     def close(self) -> None:  # noqa: B027 (most are open only while they are read)
         """Close the file, if it is open while it is not read."""
-
-
-class BagSource(MessageSource):
-    """A whole .db3 file of rosbag2, or a ROS 1 .bag.
-
-    Raises a RecordingError if rosbags can't read it.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._ros1 = Ros1Messages() if path.suffix == '.bag' else None
-        with damage_reported(path, mends=False):
-            self._reader = _reader_of(path)
-            self._reader.open()
-        self._topics = by_key(_part(connection) for connection in self._reader.connections)
-        self.topics = tuple(self._topics.values())
-        self.start_ns = self._reader.start_time
-        self.end_ns = self._reader.end_time - 1  # rosbags gives the time just after the end.
-
-    def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
-        """Yield the messages of these topics in the order in which they were received."""
-        wanted = [c for c in self._reader.connections if self._topic(c) in topics]
-        if not wanted:  # rosbags would take this for all connections.
-            return
-        with damage_reported(self._path):
-            of_connection = {c.id: self._topic(c) for c in wanted}
-            for connection, stamp_ns, data in self._reader.messages(wanted):
-                topic = of_connection[connection.id]
-                yield RawMessage(topic, stamp_ns, self._cdr(topic, data))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._reader.close()
-
-    def _topic(self, connection: Connection) -> Topic:
-        return self._topics[_part(connection).key]
-
-    def _cdr(self, topic: Topic, data: bytes) -> Buffer:
-        return (
-            data
-            if self._ros1 is None
-            else self._ros1.to_cdr(data, topic.message_type, topic.definition)
-        )
-
-
-def _part(connection: Connection) -> Topic:
-    name = ros2_type(connection.msgtype)
-    return Topic(connection.topic, name, connection.msgcount, connection.msgdef.data)
-
-
-def _reader_of(path: Path) -> rosbag1.Reader | rosbag2.Reader:
-    from rosbags import rosbag1, rosbag2  # which few recordings need
-
-    if path.suffix != '.bag':
-        return rosbag2.Reader(path)
-
-    return rosbag1.Reader(path)
 
 
 class SplitSource(MessageSource):

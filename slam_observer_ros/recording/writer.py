@@ -33,7 +33,7 @@ from rosbags.typesys import get_typestore, Stores
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.files import destination, unfinished_directory
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.run_record import LandmarkTruth, PoseTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.outgoing import OutgoingMessages

@@ -15,8 +15,8 @@ import rerun.blueprint as rrb
 
 from slam_observer_ros.common.files import destination, unfinished_directory
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import Instant
 from slam_observer_ros.evaluation.consistency import normalised_squared_errors
-from slam_observer_ros.evaluation.run_record import Instant
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.runs.reported_run import ReportedRun
 

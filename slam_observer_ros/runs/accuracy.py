@@ -1,4 +1,11 @@
-"""How accurate a replay is where the truth is known, and how people read its figures."""
+"""How good estimates are: by their errors where the truth is known, else by their likelihood.
+
+How likely what was seen is by what the filter expected measures its noise, without truth. Each
+residual r of a known landmark, given those before it, is N(0, S) with the S that the filter
+states, or else an outlier, anywhere in view. As both densities are normalised, no noise is good
+for all: too large a one spreads them out (log det S), too small a one leaves r in their tails, and
+what the filter rejects is paid for as an outlier.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +19,8 @@ from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import Smoothed, Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.metrics import (
@@ -214,3 +221,74 @@ def number_text(key: str, figure: float) -> str:
     if key.endswith(('_rad', '_rad_per_m')):
         return significant(math.degrees(figure))
     return significant(100.0 * figure if key in ('drift', 'time_compared') else figure)
+
+
+OUTLIERS = 0.02
+"""Share of the points that are taken for outliers: sensors have some per cent of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likelihood:
+    """Log densities of all residuals of a run, in natural logarithms.
+
+    ``shares`` say how much of an observation each is: those whose errors last, as
+    ``observation_correlation_time`` has it, are together one.
+    """
+
+    stamps_ns: IntArray  # (m,)
+    log_densities: FloatArray  # (m,)
+    shares: FloatArray  # (m,)
+
+    def select(self, mask: BoolArray) -> Likelihood:
+        """Return the part that ``mask`` (m,) picks."""
+        return Likelihood(self.stamps_ns[mask], self.log_densities[mask], self.shares[mask])
+
+    @property
+    def total(self) -> float:
+        """Log likelihood of them all."""
+        return float(self.shares @ self.log_densities)
+
+    @property
+    def mean(self) -> float:
+        """The same per observation with new errors; −∞ if there is none."""
+        return self.total / self.count if self.count > 0.0 else -math.inf
+
+    @property
+    def count(self) -> float:
+        """How many observations with new errors there are."""
+        return float(self.shares.sum())
+
+
+class LikelihoodRecorder:
+    """Notes the likelihood of each observation of a run; ``dimension`` is that of a point."""
+
+    def __init__(self, dimension: int, reach_m: float) -> None:
+        ball = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1) * reach_m**dimension
+        self._log_outlier = math.log(OUTLIERS / ball)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all: the run has started again."""
+        self._stamps_ns: list[int] = []
+        self._log_densities: list[FloatArray] = []
+        self._shares: list[FloatArray] = []
+
+    def note_update(self, update: Update) -> None:
+        """Take in an observation, whose innovation the estimator has judged."""
+        innovation = update.innovation
+        if innovation is None:
+            return
+        regular = math.log1p(-OUTLIERS) + innovation.log_densities
+        self._log_densities.append(np.logaddexp(regular, self._log_outlier))
+        self._shares.append(innovation.shares)
+        self._stamps_ns += [update.stamp_ns] * len(regular)
+
+    @property
+    def likelihood(self) -> Likelihood:
+        """What was noted so far."""
+        none = np.empty(0)
+        return Likelihood(
+            np.array(self._stamps_ns, dtype=np.int64),
+            np.concatenate([none, *self._log_densities]),
+            np.concatenate([none, *self._shares]),
+        )

@@ -15,8 +15,8 @@ from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.estimates import Innovations
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.evaluation.run_record import Innovations
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.runs.reported_run import ReportedRun

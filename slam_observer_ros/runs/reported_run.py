@@ -12,11 +12,10 @@ import numpy as np
 
 from slam_observer_ros.common.stamps import is_due
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, Update
+from slam_observer_ros.estimates import CalibrationEstimate, Innovations, Instant, Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
-from slam_observer_ros.evaluation.run_record import Innovations, Instant, LandmarkTruth
-from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.evaluation.trajectory import interpolate, LandmarkTruth, Trajectory
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -9,8 +9,7 @@ import re
 import textwrap
 
 from slam_observer_ros.common.errors import OutputError, ParameterError, shown, YamlError
-from slam_observer_ros.common.files import unfinished_file
-from slam_observer_ros.common.yaml_files import load_yaml, plain_value
+from slam_observer_ros.common.files import load_yaml, plain_value, unfinished_file
 from slam_observer_ros.settings.parameter_table import (
     Parameter,
     suggestion,

@@ -24,7 +24,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, PLANAR
 from slam_observer_ros.geometry.matrices import transpose
-from slam_observer_ros.observer.orientations import UNKNOWN_RAD
+from slam_observer_ros.observer.arrays import UNKNOWN_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import (
     COMPILED,
@@ -59,9 +59,10 @@ class Step:
 class Smoother:
     """Gauss–Newton iterations over a prior and the keyframes since.
 
-    ``axes`` are the d of the pose and k of a point that are estimated; of the settings,
-    ``huber_threshold`` and ``rejection_threshold`` weigh outliers, and ``calibration_drift`` says
-    whether there is one calibration, of the border, or one at each of the chain's poses.
+    ``axes`` are the d of the pose, k of a point and q of a turn that are estimated; of the
+    settings, ``huber_threshold`` and ``rejection_threshold`` weigh outliers, and
+    ``calibration_drift`` says whether there is one calibration, of the border, or one at each of
+    the chain's poses.
     ``sensed`` are the points where their sensors are calibrated.
     """
 
@@ -78,13 +79,12 @@ class Smoother:
         self._keyframes = keyframes
         self._settings, self._sensed = settings, sensed
         self._observations = Observations(axes, keyframes, settings, sensed)
-        # Unknowns of a landmark: its position, then its turn if that is estimated.
-        self._unknowns = axes.point + (axes.turn if keyframes.turns is not None else 0)
+        self._unknowns = axes.point + axes.turn  # of a landmark: its position, then its turn
         drifts, c = settings.calibration_drift > 0.0, len(prior.calibration)
         self._chained, self._shared = (c, 0) if drifts else (0, c)
         self._link_information = _link_information(keyframes, drifts)
         self._prior_information = inverse(prior.covariance)
-        self._is_usual = keyframes.turns is None and not drifts
+        self._is_usual = not axes.turn and not drifts
 
     def smooth(
         self, start: Solution, iterations: int, tolerance: float, gated: bool = True
@@ -122,14 +122,11 @@ class Smoother:
         eta[:, self._axes.pose] = change[:, :d]
         landmark_changes = border_change[c:].reshape(-1, self._unknowns)
         shifts, turns = np.hsplit(landmark_changes, [self._axes.point])
-        orientations = solution.orientations
-        if orientations is not None:
-            orientations = so3.exp(self._axes.full_turns(turns)) @ orientations
         return Solution(
             solution.poses @ se3.exp(eta),
             solution.calibrations + (border_change[:c] if c else change[:, d:]),
             solution.points + self._axes.full_points(shifts),
-            orientations,
+            so3.exp(self._axes.full_turns(turns)) @ solution.orientations,
         )
 
     def _linearise(self, solution: Solution, gated: bool = True) -> Equations:

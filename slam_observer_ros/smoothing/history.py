@@ -14,7 +14,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
-from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
@@ -24,6 +24,7 @@ from slam_observer_ros.smoothing.keyframes import (
     Keyframes,
     Links,
     no_keyframes,
+    no_turns,
     SeenTurns,
 )
 from slam_observer_ros.smoothing.prior import Prior
@@ -47,13 +48,13 @@ class Keyframe(NamedTuple):
 
 
 def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:
-    """Return how the tags of a keyframe's m points are turned."""
-    seen, m, q = keyframe.orientations, len(keyframe.rows), axes.turn
+    """Return how the tags among a keyframe's m points are turned."""
+    seen = keyframe.orientations
     if seen is None:
-        return SeenTurns(np.zeros((m, 3, 3)), np.zeros((m, 3, 3)), np.zeros((m, q, q)))
+        return no_turns(axes.turn)
     information = np.linalg.inv(axes.turn_covariances(seen.covariances)).astype(np.float64)
-    are_none = np.logical_not(seen.Z.any(axis=(1, 2)))
-    return SeenTurns(seen.Z, seen.flipped, information).without(are_none)
+    every = SeenTurns(np.arange(len(seen.rows)), seen.Z, seen.flipped, information)
+    return every.without(np.logical_not(seen.Z.any(axis=(1, 2))))
 
 
 def _all_sensed(seen: list[Keyframe]) -> Sensed | None:
@@ -106,8 +107,7 @@ class History:
         # Noise, sensitivity and drift of the motion since the last keyframe; None if at rest.
         self._motion: _Motion | None = None
         # Keyframes as arrays: the summarised ones, in pieces, and the others.
-        q = 0 if prior.orientations is None else axes.turn
-        self._none = no_keyframes(axes.p, len(prior.calibration), axes.point, q)
+        self._none = no_keyframes(axes.p, len(prior.calibration), axes.point, axes.turn)
         self._summarised: list[Keyframes] = []
         self._latest = self._none
         self._new: list[Keyframe] = []
@@ -203,8 +203,8 @@ class History:
         """Forget how the tags of the landmarks at ``rows`` were turned."""
 
         def without(keyframes: Keyframes) -> Keyframes:
-            turns, forgotten = keyframes.turns, np.isin(keyframes.landmarks, rows)
-            return replace(keyframes, turns=None if turns is None else turns.without(forgotten))
+            forgotten = np.isin(keyframes.landmarks, rows)
+            return replace(keyframes, turns=keyframes.turns.without(forgotten))
 
         self._change(without)
         self.prior = self.prior.with_unknown_turns(self._axes, rows)
@@ -296,11 +296,10 @@ class History:
             sensitivities=to_body @ np.array([link.sensitivity for link in links]),
         )
 
-    def _turns(self, seen: list[Keyframe]) -> SeenTurns | None:
-        """Return how the tags of all points are turned, if that is estimated."""
-        if self.prior.orientations is None:
-            return None
-        return joined_turns([_seen_turns(part, self._axes) for part in seen])
+    def _turns(self, seen: list[Keyframe]) -> SeenTurns:
+        """Return how the tags among all points are turned."""
+        turns = [_seen_turns(part, self._axes) for part in seen]
+        return joined_turns(turns, [len(part.rows) for part in seen])
 
     def _covariances(self, seen: list[Keyframe]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""

@@ -12,19 +12,22 @@ from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 
 @dataclass(frozen=True, slots=True)
 class SeenTurns:
-    """How the tags of M observed points are turned; zero where they show no orientation."""
+    """How T tags are turned that are among M observed points."""
 
-    Z: FloatArray  # (M, 3, 3) from the tag's own axes to the body's
-    flipped: FloatArray  # (M, 3, 3) the other orientation that looks nearly the same
-    information: FloatArray  # (M, q, q) inverse covariance of it, along the body's axes, 1/rad²
+    points: IntArray  # (T,) which of these
+    Z: FloatArray  # (T, 3, 3) from the tag's own axes to the body's
+    flipped: FloatArray  # (T, 3, 3) the other orientation that looks nearly the same
+    information: FloatArray  # (T, q, q) inverse covariance of it, along the body's axes, 1/rad²
 
     def only(self, kept: BoolArray) -> SeenTurns:
-        """Return those of some of the points (M,)."""
-        return SeenTurns(self.Z[kept], self.flipped[kept], self.information[kept])
+        """Return those of some of the points (M,), numbered without the others."""
+        turns = self.without(~kept)
+        return replace(turns, points=(np.cumsum(kept) - 1)[turns.points])
 
     def without(self, forgotten: BoolArray) -> SeenTurns:
         """Return what is left if some of the points (M,) show no orientation."""
-        return replace(self, information=np.where(forgotten[:, None, None], 0.0, self.information))
+        left = ~forgotten[self.points]
+        return SeenTurns(*(getattr(self, field.name)[left] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,7 @@ class Keyframes:
     information: FloatArray  # (M, k, k) inverse covariance of it, body frame, 1/m²
     # (M,) how much of it counts: less than 1 where its error is partly that of a point before
     shares: FloatArray
-    turns: SeenTurns | None = None  # where orientations of landmarks are estimated
+    turns: SeenTurns  # of those that are tags, where orientations are estimated
     sensed: Sensed | None = None  # (M,) as the sensors showed them, where these are calibrated
 
     def with_slips(self, are_slips: BoolArray | None = None) -> Keyframes:
@@ -89,7 +92,7 @@ class Keyframes:
             points=self.points[kept],
             information=self.information[kept],
             shares=self.shares[kept],
-            turns=None if self.turns is None else self.turns.only(kept),
+            turns=self.turns.only(kept),
             sensed=None if self.sensed is None else self.sensed.select(kept),
         )
 
@@ -114,22 +117,20 @@ class Solution:
     poses: FloatArray  # (S + 1, 4, 4) of the prior, then of each keyframe
     calibrations: FloatArray  # (S + 1, c); all the same unless it drifts
     points: FloatArray  # (n, 3) landmarks, metres
-    # (n, 3, 3) how they are turned, zero where that is not known; None if it is not estimated
-    orientations: FloatArray | None = None
+    orientations: FloatArray  # (n, 3, 3) how they are turned, zero where that is not known
 
 
 def joined(parts: list[Keyframes]) -> Keyframes:
     """Return the keyframes of one or more parts, one after the other."""
     own = [field.name for field in fields(Keyframes) if field.name not in _OF_PARTS]
     together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in own}
-    turns = [part.turns for part in parts if part.turns is not None]
     sensed = [part.sensed for part in parts if part.sensed is not None]
     return replace(
         parts[0],
         **together,
         links=_joined_links([part.links for part in parts]),
         slipped=_joined_links([part.slipped for part in parts]),
-        turns=joined_turns(turns) if turns else None,
+        turns=joined_turns([part.turns for part in parts], [len(part.points) for part in parts]),
         sensed=joined_sensed(sensed) if sensed else None,
     )
 
@@ -142,10 +143,16 @@ def _joined_links(parts: list[Links]) -> Links:
     return Links(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def no_keyframes(d: int, c: int, k: int, q: int = 0) -> Keyframes:
-    """Return no keyframes; d, c and k as in :class:`.Smoother`, q if turns are estimated."""
-    none = np.empty(0, dtype=np.int64)
+def no_turns(q: int) -> SeenTurns:
+    """Return those of points that show no orientation; q of a turn are estimated."""
     no_rotations = np.empty((0, 3, 3))
+    none = np.empty(0, dtype=np.int64)
+    return SeenTurns(none, no_rotations, no_rotations, np.empty((0, q, q)))
+
+
+def no_keyframes(d: int, c: int, k: int, q: int) -> Keyframes:
+    """Return no keyframes; d, c and k as in :class:`.Smoother`, q of a turn."""
+    none = np.empty(0, dtype=np.int64)
     no_links = Links(np.empty((0, 4, 4)), np.empty((0, d, d)), np.empty((0, d, c)))
     return Keyframes(
         links=no_links,
@@ -158,13 +165,15 @@ def no_keyframes(d: int, c: int, k: int, q: int = 0) -> Keyframes:
         points=np.empty((0, 3)),
         information=np.empty((0, k, k)),
         shares=np.empty(0),
-        turns=SeenTurns(no_rotations, no_rotations, np.empty((0, q, q))) if q else None,
+        turns=no_turns(q),
     )
 
 
-def joined_turns(parts: list[SeenTurns]) -> SeenTurns:
-    """Return those of several parts, one after the other."""
+def joined_turns(parts: list[SeenTurns], counts: list[int]) -> SeenTurns:
+    """Return those of several parts, one after the other, of so many points each."""
+    before = np.cumsum([0, *counts[:-1]])
     return SeenTurns(
+        np.concatenate([part.points + first for part, first in zip(parts, before, strict=True)]),
         np.concatenate([part.Z for part in parts]),
         np.concatenate([part.flipped for part in parts]),
         np.concatenate([part.information for part in parts]),

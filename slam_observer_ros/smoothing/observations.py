@@ -16,9 +16,9 @@ from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.geometry.sensor_mounting import Sensed, sensitivity, shown_at, turning
-from slam_observer_ros.observer.orientations import flip_verdicts
+from slam_observer_ros.observer.arrays import flip_verdicts
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.keyframes import Keyframes, SeenTurns, Solution
+from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 
 FlatSensed: TypeAlias = tuple[IntArray, FloatArray, FloatArray, FloatArray, IntArray]
 """What C reads of the sensors of M points, see :meth:`SensedPoints.flat`."""
@@ -58,10 +58,9 @@ class SensedPoints:
         values = np.where(columns >= 0, estimated, stated)
         return sensed.sensors, sensed.origins, sensed.arms, values, columns
 
-    def turned(self, calibrations: FloatArray, Z: FloatArray) -> FloatArray:
-        """Return orientations exp(ψ) Z (M, 3, 3), body frame, that the sensors showed as Z."""
-        rotated: FloatArray = so3.exp(self._values(calibrations)[:, :3]) @ Z
-        return rotated
+    def turns(self, calibrations: FloatArray) -> FloatArray:
+        """Return exp(ψ) (M, 3, 3), by which what is seen of orientations is turned."""
+        return so3.exp(self._values(calibrations)[:, :3])
 
     def turning(self, calibrations: FloatArray) -> FloatArray:
         """Return J(ψ) (M, 3, c_s): how orientations turn with the calibration."""
@@ -118,16 +117,15 @@ class Observations:
         D = np.empty((len(error), k, 0))
         if self._sensed is not None:
             D = self._sensed.sensitivity(self._calibrations(solution), predicted)[:, :k]
-        if keyframes.turns is None:
-            return normal(_joined(-C, chained, J_point, -D), information, error)
         unturned = np.zeros((len(error), k, self._axes.turn))
         J = _joined(-C, chained, np.concatenate([J_point, unturned], axis=2), -D)
         H, gradient = normal(J, information, error)
         # An orientation counts for as little as the point it was seen with.
-        counted = keyframes.shares * self._falloff(squared, gated)
-        seen = self._of_turns(keyframes.turns, R, solution, chained, counted, gated)
-        H_turn, gradient_turn = seen
-        return H + H_turn, gradient + gradient_turn
+        tags, counted = keyframes.turns.points, keyframes.shares * self._falloff(squared, gated)
+        of_turns = self._of_turns(solution, R[tags], chained, counted[tags], gated)
+        H[tags] += of_turns[0]
+        gradient[tags] += of_turns[1]
+        return H, gradient
 
     def some_are_gated(self, solution: Solution) -> bool:
         """Return whether a filter would reject some of the points."""
@@ -154,36 +152,34 @@ class Observations:
 
     def _of_turns(
         self,
-        turns: SeenTurns,
-        R: FloatArray,
         solution: Solution,
+        R: FloatArray,
         chained: int,
         counted: FloatArray,
         gated: bool,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what orientations say, seen from poses turned by ``R`` (M, 3, 3).
+        """Return what T orientations say, seen from poses turned by ``R`` (T, 3, 3).
 
         Nothing, where none is known or the flipped twin is as likely.
         """
-        axes, q = self._axes, self._axes.turn
-        if solution.orientations is None:
-            raise TypeError('orientations were seen that are not estimated')
-        B = solution.orientations[self._keyframes.landmarks]
+        axes, q, turns = self._axes, self._axes.turn, self._keyframes.turns
+        B = solution.orientations[self._keyframes.landmarks[turns.points]]
         predicted = transpose(R) @ B
         Z, flipped, D = turns.Z, turns.flipped, np.empty((len(B), q, 0))
         if self._sensed is not None:
             calibrations = self._calibrations(solution)
-            Z, flipped = (self._sensed.turned(calibrations, turned) for turned in (Z, flipped))
-            D = self._sensed.turning(calibrations)
+            turned = self._sensed.turns(calibrations)[turns.points]
+            Z, flipped = turned @ Z, turned @ flipped
+            D = self._sensed.turning(calibrations)[turns.points]
         error = so3.log(predicted @ transpose(Z))
         J_turn = axes.turn_covariances(so3.left_jacobian_inverse(error))
-        if D.shape[2]:
+        if self._sensed is not None:
             D = (so3.left_jacobian_inverse(-error) @ D)[:, axes.turned]
         error = axes.turns(error)
         # Derivatives by pose, turn and calibration.
         by_pose = np.concatenate([-J_turn, np.zeros((len(error), q, axes.p - q))], axis=2)
         by_turn = np.zeros((len(error), q, axes.point + q))
-        by_turn[:, :, -q:] = J_turn @ axes.turn_covariances(transpose(R))
+        by_turn[:, :, axes.point :] = J_turn @ axes.turn_covariances(transpose(R))
         J = _joined(by_pose, chained, by_turn, -D)
         # Of the two that look alike it is the likelier one; then Huber's weights.
         twin = axes.turns(so3.log(predicted @ transpose(flipped)))

@@ -12,7 +12,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import definite_inverse, solve_definite, transpose
-from slam_observer_ros.observer.orientations import UNKNOWN_RAD
+from slam_observer_ros.observer.arrays import UNKNOWN_RAD
 
 ANYWHERE_M = 1e3
 """Standard deviation of an unknown landmark, metres."""
@@ -25,18 +25,18 @@ EXACT_M = 1e-6
 class Prior:
     """Estimates with the covariance of their errors: pose exp(η), c + dc and p_i + dp_i.
 
-    Where orientations B_i are estimated, dp_i ends in the turn ω_i of exp(ω_i) B_i.
+    Where orientations B_i are estimated, dp_i ends in the turn ω_i of exp(ω_i) B_i, on
+    as many of its axes as ``axes`` have.
     """
 
     pose: FloatArray  # (4, 4) P
     calibration: FloatArray  # (c,)
     points: FloatArray  # (n, 3) landmarks that were known, metres; the first n of the map
+    orientations: FloatArray  # (n, 3, 3) of these, zero where that is not known, or estimated
     covariance: FloatArray  # (d + c + k n, d + c + k n) of (η, dc, dp)
     # Whether it is that of (η, dc, dy) instead, of y_i = P⁻¹ p_i as seen from the pose; then
     # orientations are as seen from there, too.
     is_relative: bool = False
-    # (n, 3, 3) of the landmarks, zero where that is not known; None if it is not estimated
-    orientations: FloatArray | None = None
 
     def relative(self, axes: EstimatedAxes) -> Prior:
         """Return the same knowledge, but of where the landmarks lie as seen from the pose.
@@ -82,9 +82,7 @@ class Prior:
             self,
             points=np.delete(self.points, known, axis=0),
             covariance=np.delete(np.delete(self.covariance, columns, 0), columns, 1),
-            orientations=(
-                None if self.orientations is None else np.delete(self.orientations, known, axis=0)
-            ),
+            orientations=np.delete(self.orientations, known, axis=0),
         )
 
     def with_calibration(
@@ -108,8 +106,6 @@ class Prior:
 
     def with_unknown_turns(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior with landmarks at ``rows`` that may be turned in any way."""
-        if self.orientations is None:
-            return self
         known, columns = self._known(axes, rows)
         orientations = self.orientations.copy()
         orientations[known] = 0.0
@@ -124,7 +120,7 @@ class Prior:
         pose: FloatArray,
         calibration: FloatArray,
         points: FloatArray,
-        orientations: FloatArray | None = None,
+        orientations: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Return Jᵀ W J and Jᵀ W e of the error e of estimates, by (η, dc, dp) of these.
 
@@ -136,11 +132,9 @@ class Prior:
         eta = se3.log(se3.inverse(self.pose) @ pose)
         y = self._seen_from(pose, points[: len(self.points)])
         shifts = (y - self._seen_from(self.pose, self.points))[:, : axes.point]
-        J_turns = None
-        if self.orientations is not None and orientations is not None:
-            turns = self._turns_from(pose, orientations[: len(self.points)])
-            shifts = np.hstack([shifts, axes.turns(turns)])
-            J_turns = axes.turn_covariances(so3.left_jacobian_inverse(turns))
+        turns = self._turns_from(pose, orientations[: len(self.points)])
+        shifts = np.hstack([shifts, axes.turns(turns)])
+        J_turns = axes.turn_covariances(so3.left_jacobian_inverse(turns))
         off = [eta[axes.pose], calibration - self.calibration, shifts.ravel()]
         error = np.concatenate(off)
         J_eta = se3.left_jacobian_inverse(-eta)[axes.pose, axes.pose]
@@ -154,11 +148,9 @@ class Prior:
             Of orientations −C and Rᵀ are multiplied by the Jacobian of the logarithm.
             """
             pulled: FloatArray = rows.copy()
-            if J_turns is not None:
-                blocks = pulled[first:].reshape(len(J_turns), k, rows.shape[1])
-                of_turns = blocks[:, axes.point :]
-                of_turns[:] = transpose(J_turns) @ of_turns
-                rows = pulled.copy()
+            of_turns = pulled[first:].reshape(len(J_turns), k, rows.shape[1])[:, axes.point :]
+            of_turns[:] = transpose(J_turns) @ of_turns
+            rows = pulled.copy()
             pulled[:d] = J_eta.T @ rows[:d] - C.T @ rows[first:]
             pulled[first:] = _turned(rows[first:], R)
             return pulled
@@ -175,34 +167,28 @@ class Prior:
 
         As points are, they are seen from a pose; zero where one of them is not known.
         """
-        before, now = self.orientations, orientations
-        if before is None:
-            raise TypeError('a prior of points alone knows no orientations')
-        are_known = np.logical_and(before.any(axis=(1, 2)), now.any(axis=(1, 2)))
+        are_known = self.orientations.any(axis=(1, 2)) & orientations.any(axis=(1, 2))
+        before, now = self.orientations[are_known], orientations[are_known]
         if self.is_relative:
             before, now = self.pose[:3, :3].T @ before, pose[:3, :3].T @ now
-        turns = so3.log(now @ transpose(before))
-        turns[~are_known] = 0.0
+        turns = np.zeros((len(orientations), 3))
+        turns[are_known] = so3.log(now @ transpose(before))
         return turns
 
     def _unknowns(self, axes: EstimatedAxes) -> int:
         """Return how many unknowns a landmark has."""
-        return axes.point + (axes.turn if self.orientations is not None else 0)
+        return axes.point + axes.turn
 
     def _output_matrix(self, axes: EstimatedAxes, y: FloatArray) -> FloatArray:
         """Return (n, k, d) blocks: how the pose moves and turns landmarks at ``y`` (n, 3)."""
         C = axes.output_matrix(y)
-        if self.orientations is None:
-            return C
         turns = np.eye(axes.turn, axes.p)
         return np.concatenate([C, np.tile(turns, (len(y), 1, 1))], axis=1)
 
     def _rotation(self, axes: EstimatedAxes, pose: FloatArray) -> FloatArray:
         """Return R (k, k) of a pose, for the unknowns of a landmark."""
-        R = pose[: axes.point, : axes.point]
-        if self.orientations is None:
-            return R
-        full: FloatArray = block_diag(R, axes.turn_covariances(pose[None, :3, :3])[0])
+        R, turned = pose[: axes.point, : axes.point], axes.turn_covariances(pose[None, :3, :3])[0]
+        full: FloatArray = block_diag(R, turned)
         return full
 
     def _turns(self, axes: EstimatedAxes) -> slice:

@@ -9,7 +9,7 @@ which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After
 there may be no such summary until landmarks seen before are seen again. Else the cost does not
 grow with the history; only :meth:`Relinearisation.smooth` needs all of it.
 
-It is O(n³) for n landmarks. In a map without a dense covariance (:mod:`.compressed_covariance`)
+It is O(n³) for n landmarks. In a map without a dense covariance (:class:`.CompressedCovariance`)
 nothing is relinearised any more. Its history goes on, to be smoothed, until it would have to begin
 again: then it is given up. Among tags the covariance stays dense, but from
 :data:`MAX_UNKNOWNS` on nothing is relinearised, either.
@@ -80,7 +80,6 @@ class KnownErrors(Protocol):
     """What there must be of :class:`.Errors`; P may become one for large maps."""
 
     observer: Observer
-    axes: EstimatedAxes
     joint: JointCovariance
 
 
@@ -93,7 +92,8 @@ class Relinearisation:
     """
 
     def __init__(self, errors: KnownErrors, calibration: Calibration, settings: Settings) -> None:
-        self._errors, self._settings, self._axes = errors, settings, errors.axes
+        self._errors, self._settings = errors, settings
+        self._axes = errors.joint.chart.axes
         self._observer, self._calibration = errors.observer, calibration
         self._observation_noise = ObservationNoise(settings)
         self._warning = _Warning()
@@ -316,8 +316,7 @@ class Relinearisation:
         self._calibration.shift(end.calibrations[-1] - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)
-        if end.orientations is not None:
-            self._observer.orientations.B[...] = end.orientations
+        observer.orientations.B[...] = end.orientations
 
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
         calibration, sensed = self._calibration, None
@@ -328,7 +327,7 @@ class Relinearisation:
 
     def _without_outliers_of_then(self, smoother: Smoother, start: Solution) -> Solution:
         """Return where iterations begin among tags, given the present estimates."""
-        if start.orientations is None:
+        if not self._axes.turn:
             return start
         # The poses are those of their time, the map is that of now: after a loop was closed much
         # of what was seen from them is far off, and would be taken for outliers.
@@ -340,7 +339,8 @@ class Relinearisation:
         calibrations = np.tile(self._calibration.values, (len(poses), 1))
         if self._calibration.drifts:
             calibrations = np.array(self.history.calibrations[first:])
-        return Solution(poses, calibrations, self._observer.points, self._orientations())
+        observer = self._observer
+        return Solution(poses, calibrations, observer.points, observer.orientations.B.copy())
 
     def _known(self) -> Prior:
         """Return what is known now."""
@@ -349,11 +349,8 @@ class Relinearisation:
         P = joint.of_robot if self._is_given_up else joint.of_positions(points)
         P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)
         values = self._calibration.values
-        return Prior(observer.A.copy(), values, points, P, orientations=self._orientations())
-
-    def _orientations(self) -> FloatArray | None:
-        """Return those of the landmarks (n, 3, 3), if they are estimated."""
-        return self._observer.orientations.B.copy() if self._joint.chart.turn else None
+        orientations = observer.orientations.B[: len(points)].copy()
+        return Prior(observer.A.copy(), values, points, orientations, P)
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:

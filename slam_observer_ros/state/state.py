@@ -253,7 +253,6 @@ class State:
         covariance = step.marginal()[entries, entries]
         values = calibration.shifted(found.calibrations[-1] - calibration.values)
         history, P = self.relinearisation.history, self.observer.reference_pose
-        turned = found.orientations
         return Smoothed(
             stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
             poses=P @ found.poses[1:],
@@ -261,7 +260,7 @@ class State:
             ids=self.landmarks.ids[rows],
             since=history.since,
             slips=slips,
-            orientations=None if turned is None else P[:3, :3] @ turned[rows],
+            orientations=P[:3, :3] @ found.orientations[rows],
             calibration=calibration.estimates(np.diagonal(covariance), values),
             calibration_correlations=correlations_of(covariance),
         )

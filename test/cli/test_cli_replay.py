@@ -13,7 +13,7 @@ import recordings
 import ros_messages as ros
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.evaluation.run_record import PoseTruth
+from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.simulation import Scenario, Simulation

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import pytest
 from tum_files import read_tum
 
-from slam_observer_ros.evaluation.run_record import LandmarkTruth, PoseTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap

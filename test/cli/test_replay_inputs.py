@@ -8,7 +8,7 @@ import pytest
 import ros_messages as ros
 from tum_files import read_tum
 
-from slam_observer_ros.evaluation.run_record import LandmarkTruth, PoseTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.reader import Recording

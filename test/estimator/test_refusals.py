@@ -13,7 +13,7 @@ from slam_observer_ros.common.errors import MapError, ParameterError
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator.checks import MAX_MEASURED
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.run_record import PoseTruth
+from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     FIRST_AUTOMATIC_ID,

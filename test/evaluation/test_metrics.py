@@ -12,8 +12,7 @@ from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation import consistency, metrics
 from slam_observer_ros.evaluation.metrics import ConfigurationError, MAX_JOINT
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, Trajectory
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
 

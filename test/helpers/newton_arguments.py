@@ -78,7 +78,7 @@ def random_smoother(rng):
     huber, gate = rng.choice([0.0, 1.345]), rng.choice([2.0, 1e9])
     settings = replace(problem.settings, huber_threshold=huber, rejection_threshold=gate)
     sensed = random_sensed(rng, problem.keyframes.points, c) if rng.integers(2) else None
-    smoother = Smoother(axes, problem.prior, problem.keyframes, settings, sensed)
+    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, settings, sensed)
     start = replace(problem.start, calibrations=problem.start.calibrations + 0.1)
     return smoother, start
 

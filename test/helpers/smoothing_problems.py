@@ -45,8 +45,8 @@ class Problem:
     ):
         rng = np.random.default_rng(seed)
         d, k, c = axes.p, axes.point, calibrations
-        self.axes, self.d, self.k, self.c, self.drifts = axes, d, k, c, drifts
-        self.q = axes.turn if tags else 0
+        self.axes = axes if tags else axes.of_points()
+        self.d, self.k, self.c, self.drifts, self.q = d, k, c, drifts, self.axes.turn
         self.settings = replace(LEAST_SQUARES, calibration_drift=float(drifts))
         motions = se3.exp(self._tangents(0.3 * rng.normal(size=(POSES, d))))
         prior_size = d + c + (k + self.q) * known_landmarks
@@ -56,6 +56,7 @@ class Problem:
             0.1 * rng.normal(size=c),
             points[:known_landmarks]
             + 0.05 * axes.full_points(rng.normal(size=known_landmarks * k)),
+            np.zeros((known_landmarks, 3, 3)),
             random_covariances(rng, 1, prior_size, 0.1)[0],
             is_relative,
         )
@@ -67,7 +68,7 @@ class Problem:
         seen = se3.transform(se3.inverse(poses[keyframes + 1]), points[landmarks][:, None])[
             :, 0
         ] + 0.1 * axes.full_points(rng.normal(size=len(keyframes) * k))
-        none = no_keyframes(d, c, k)
+        none = no_keyframes(d, c, k, self.q)
         self.keyframes = Keyframes(
             Links(
                 motions,
@@ -83,9 +84,11 @@ class Problem:
             seen,
             np.linalg.inv(random_covariances(rng, len(keyframes), k, 0.1)),
             rng.uniform(0.1, 1.0, len(keyframes)),
+            none.turns,
         )
         eta = self._tangents(0.1 * rng.normal(size=(POSES + 1, d)))
-        self.start = Solution(poses @ se3.exp(eta), np.zeros((POSES + 1, c)), points)
+        no_turns = np.zeros((len(points), 3, 3))
+        self.start = Solution(poses @ se3.exp(eta), np.zeros((POSES + 1, c)), points, no_turns)
         if tags:
             self._add_turns(rng, poses[keyframes + 1, :3, :3], landmarks, known_landmarks)
 
@@ -96,7 +99,8 @@ class Problem:
         Z = R.swapaxes(1, 2) @ B[landmarks] @ self._turned(0.1 * rng.normal(size=(M, q)))
         # As far as these are from each other, no flip does harm.
         flipped = Z @ so3.exp(np.full((M, 3), 1e-3))
-        turns = SeenTurns(Z, flipped, np.linalg.inv(random_covariances(rng, M, q, 0.1)))
+        information = np.linalg.inv(random_covariances(rng, M, q, 0.1))
+        turns = SeenTurns(np.arange(M), Z, flipped, information)
         self.keyframes = replace(self.keyframes, turns=turns)
         of_prior = self._turned(0.05 * rng.normal(size=(known_landmarks, q)))
         self.prior = replace(self.prior, orientations=of_prior @ B[:known_landmarks])
@@ -124,7 +128,7 @@ class Problem:
             solution.poses @ se3.exp(self._tangents(chain[:, : self.d])),
             solution.calibrations + calibrations,
             solution.points + self.axes.full_points(changes[:, : self.k].ravel()),
-            self._turned(changes[:, self.k :]) @ orientations if self.q else None,
+            self._turned(changes[:, self.k :]) @ orientations,
         )
 
     def residuals(self, solution):

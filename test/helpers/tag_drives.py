@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.run_record import PoseTruth
+from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 

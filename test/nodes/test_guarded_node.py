@@ -32,7 +32,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.observer_core import ObserverCore
 from slam_observer_ros.nodes.executables import observer_node
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
-from slam_observer_ros.nodes.services.control_services import ControlServices
+from slam_observer_ros.nodes.control_services import ControlServices
 
 def fail(*_):
     raise np.linalg.LinAlgError('singular matrix')

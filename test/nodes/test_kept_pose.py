@@ -16,8 +16,8 @@ from slam_observer_ros import Estimator, Settings
 from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.nodes.services import initial_pose
-from slam_observer_ros.nodes.services.initial_pose import (
+from slam_observer_ros.nodes import initial_pose
+from slam_observer_ros.nodes.initial_pose import (
     KeptPose,
     read_pose,
     StoredPose,

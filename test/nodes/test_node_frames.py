@@ -19,7 +19,7 @@ pytest.importorskip('tf2_msgs')
 from robots import own_topics, pose_of, Robot, stamp_ns, TransformSender
 from tf2_msgs.msg import TFMessage
 
-from slam_observer_ros.evaluation.run_record import PoseTruth
+from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import TransformBuffer

@@ -30,10 +30,10 @@ from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.estimate_messages import StateMessages, uncertain_pose
 from slam_observer_ros.messages.poses import pose_matrices
+from slam_observer_ros.nodes.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.observer_nodes import ObserverNode
-from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -10,7 +10,7 @@ import pytest
 import setuptools  # noqa: F401 (provides distutils)
 import yaml
 
-from slam_observer_ros.nodes.services import initial_pose
+from slam_observer_ros.nodes import initial_pose
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.settings.parameter_table import table

@@ -19,7 +19,7 @@ import setuptools  # noqa: F401 (provides distutils)
 import yaml
 
 from slam_observer_ros.cli.main import make_parser
-from slam_observer_ros.cli.replay_summary import as_json, identity
+from slam_observer_ros.cli.replay import as_json, identity
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map

@@ -16,12 +16,13 @@ import ros_messages as ros
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.common.errors import RecordingError
-from slam_observer_ros.evaluation.run_record import LandmarkTruth
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.poses import PoseBlock, PoseMessage
+from slam_observer_ros.recording.bag_source import BagSource
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, other_frames
-from slam_observer_ros.recording.sources import BagSource, SplitSource
+from slam_observer_ros.recording.sources import SplitSource
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings.input_settings import InputSettings

@@ -15,8 +15,8 @@ from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.recording.bag_source import SalvagedSource
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.salvage import SalvagedSource
 from slam_observer_ros.recording.salvage_formats import SCANS
 from slam_observer_ros.recording.writer import RecordingWriter
 

@@ -40,6 +40,7 @@ from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.prior import Prior
 from slam_observer_ros.smoothing.relinearisation import Relinearisation
 
+NOTHING_KNOWN = np.empty((0, 3)), np.empty((0, 3, 3))
 NOTHING = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
 """What a keyframe holds of an observation in which no landmark was seen."""
 
@@ -96,7 +97,8 @@ def test_marginal_is_that_of_the_dense_inverse(problem):
 @pytest.mark.parametrize('forgotten', [[], [0], [0, 1]])
 @pytest.mark.parametrize('tags', [False, True])
 def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten, tags):
-    prior = Problem(axes, 2, seed=5, tags=tags).prior
+    problem = Problem(axes, 2, seed=5, tags=tags)
+    axes, prior = problem.axes, problem.prior
     rows = np.array(forgotten, dtype=np.int64)
     absolute = prior.without(axes, rows)
     relative = prior.relative(axes).without(axes, rows)
@@ -110,6 +112,7 @@ def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
 @pytest.mark.parametrize('turns_together', [True, False])
 def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_together):
+    axes = axes.of_points()
     d, points = axes.p, axes.full_points(np.arange(4.0 * axes.point))
     together = np.concatenate([np.eye(d), axes.output_matrix(points).reshape(-1, d)])
     turn, own = (
@@ -119,7 +122,9 @@ def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_togethe
     covariance = together @ turn @ together.T + own
     if not turns_together:
         covariance[:d, d:] = covariance[d:, :d] = 0.0
-    prior, angle_rad = Prior(np.eye(4), np.empty(0), points, covariance).least_nonlinear(axes)
+    prior, angle_rad = Prior(
+        np.eye(4), np.empty(0), points, np.zeros((4, 3, 3)), covariance
+    ).least_nonlinear(axes)
     assert prior.is_relative == turns_together
     assert angle_rad < 0.1
 
@@ -143,7 +148,7 @@ def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
     def keyframes(*cuts):
         calibration = Calibration(FilterArrays(np.eye(4)), settings, axes)
         count = d + calibration.count
-        start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
+        start = Prior(np.eye(4), calibration.values, *NOTHING_KNOWN, np.eye(count))
         history = History(axes, ObservationNoise(settings), start, 'the start')
         for a, b in pairwise((0, *cuts, k)):
             pieces = path[a : b + 1], V[a:b], dt_s[a:b], covariances[a:b]
@@ -165,7 +170,7 @@ def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     settings = Settings(linear_scale_stddev=(0.1, 0.1, 0.1), angular_bias_stddev=(0.0, 0.0, 0.1))
     calibration = Calibration(FilterArrays(np.eye(4)), settings, axes)
     c = calibration.count
-    start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(d + c))
+    start = Prior(np.eye(4), calibration.values, *NOTHING_KNOWN, np.eye(d + c))
     history = History(axes, ObservationNoise(settings), start, 'the start')
     turn = np.zeros((3, 6))
     turn[:, axes.pose] = rng.normal(size=(3, d))

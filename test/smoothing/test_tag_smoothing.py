@@ -20,7 +20,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
 from slam_observer_ros.smoothing.keyframes import no_keyframes, SeenTurns, Solution
 from slam_observer_ros.smoothing.observations import Observations
-from slam_observer_ros.state.tag_orientations import flipped
+from slam_observer_ros.state.step import flipped
 
 SIGMA_RAD, SIGMA_M = 0.05, 0.05
 TURN_NOISE, SPEED_NOISE = 0.1, 0.1  # rad/√s, m/√s
@@ -73,7 +73,7 @@ def test_derivatives_of_an_orientation_seen_are_those_of_its_error(axes, rng):
         points=point,
         information=np.zeros((1, k, k)),
         shares=np.ones(1),
-        turns=SeenTurns(Z, Z, W[None]),
+        turns=SeenTurns(np.arange(1), Z, Z, W[None]),
     )
     solution = Solution(np.array([np.eye(4), pose]), np.empty((2, 0)), point, B)
     H, gradient = Observations(axes, keyframes, SETTINGS).normal_equations(solution, 0)

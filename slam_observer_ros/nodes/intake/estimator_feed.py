@@ -30,7 +30,7 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.clouds import scan_problem
 from slam_observer_ros.nodes.guarded_node import described, ThrottledLog
-from slam_observer_ros.nodes.intake.clocks import ClockChange, ClockOffset
+from slam_observer_ros.nodes.intake.lateness import ClockChange, ClockOffset
 from slam_observer_ros.settings.input_settings import ON_TF
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -19,7 +19,7 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.intake.load import Backlog, LoadShedding, Waiting
+from slam_observer_ros.nodes.intake.lateness import Backlog, LoadShedding, Waiting
 from slam_observer_ros.nodes.message_classes import message_class
 
 DISCOVERY_S = 5.0

@@ -1,1 +1,0 @@
-"""Services and topics by which others steer the observer."""
