@@ -2,7 +2,7 @@
 
 With the attitude error w = ε_Ω and d_i = ξ_i − ε_v, which are normal in the filter's coordinates,
 a landmark is seen wrongly by R̂ᵀ J(w) d_i, J the left Jacobian of SO(3), exactly. Where
-w is not small that is bent like a banana, and has another covariance than d_i.
+w is not small this error is bent like a banana, and has another covariance than d_i.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def turned_moment(
     k = 3 if q == 3 else 2
     scales, axes = np.linalg.eigh(of_turns)
     root = axes * np.sqrt(np.maximum(scales, 0.0))
-    # d_i = G z + what is independent of z, w = root z, z of unit variance.
+    # d_i = G z + a part that is independent of z, w = root z, z of unit variance.
     G = with_turns @ np.linalg.pinv(root).T
     others = (covariance - G @ G.T).reshape(-1, k, len(covariance))
     moment = np.zeros_like(covariance)

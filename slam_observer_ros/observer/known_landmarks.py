@@ -14,7 +14,7 @@ from slam_observer_ros.geometry.matrices import block_diagonal, turned
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownLandmarks:
-    """n landmarks of a map in one frame, of which t are tags with an orientation."""
+    """n landmarks of a map in one frame; t of them are tags with an orientation."""
 
     points: FloatArray  # (n, 3) metres
     covariances: FloatArray  # (n, 3, 3) of each position, m²
@@ -33,7 +33,7 @@ class KnownLandmarks:
         return tags_among(self.orientations)
 
     def select(self, rows: IntArray | BoolArray) -> KnownLandmarks:
-        """Return those at ``rows``."""
+        """Return the landmarks at ``rows``."""
         R, sigmas, joint = self.orientations, self.sigmas, self.joint
         return KnownLandmarks(
             self.points[rows],

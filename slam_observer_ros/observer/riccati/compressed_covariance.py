@@ -1,12 +1,11 @@
 """The joint covariance of large maps: a dense one of few landmarks, others follow when needed.
 
-P is that of pose, calibration and the landmarks that are *active*: near, or seen of late
-(:mod:`.active_landmarks`). What motions and observations do to it comes to all others when these
-become active. It is exact but for one thing: what the noise of a motion does to the error ξ_i of
-a landmark out of view is judged by a reference position, which is set again when the estimate is
-too far off (J. Guivant and E. Nebot, *Optimization of the SLAM algorithm for real-time
-implementation*, 2001). As long as there are few landmarks all are active. How the others follow:
-:mod:`.following_landmarks`.
+P has pose, calibration and the *active* landmarks: near ones, and others seen of late
+(:mod:`.active_landmarks`). Motions and observations change P alone, and come to another landmark
+when it becomes active (:mod:`.following_landmarks`). This is exact but for one thing: the noise of
+a motion acts on the error ξ_i of a landmark out of view by its position, for which a reference
+stands until the estimate is too far off (J. Guivant and E. Nebot, *Optimization of the SLAM
+algorithm for real-time implementation*, 2001). In a small map all landmarks are active.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
 
 class CompressedCovariance(ActiveLandmarks):
-    """What is known of all landmarks, wherever they are."""
+    """The covariance of all landmarks, active or not."""
 
     @property
     def references(self) -> FloatArray:
-        """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
+        """(n, 3) positions that errors are judged by: estimates of active landmarks, else y_i°."""
         points = self._observer.y_ref + self._observer.a
         for view in self._following.views(self._others):
             points[view.rows] = view.references
@@ -52,7 +51,7 @@ class CompressedCovariance(ActiveLandmarks):
         return with_pose, own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all together, (p, m k) and (m k, m k)."""
+        """Return :meth:`output` of all together, (p, m k) and (m k, m k)."""
         if (self._places[rows] >= 0).all():
             return super().outputs(C, rows)
         unique, at = np.unique(rows, return_inverse=True)
@@ -101,7 +100,7 @@ class CompressedCovariance(ActiveLandmarks):
         return self.marginal(every).of_landmarks(at, points, of_tags)
 
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags are with all that is postponed."""
+        """Return orientations ``B`` (m, 3, 3) of tags after all that is postponed."""
         every = np.tile(np.eye(3), (len(self._places), 1, 1))
         for view in self._following.views(np.unique(rows[self._places[rows] < 0])):
             every[view.rows] = view.turns
@@ -124,7 +123,7 @@ class CompressedCovariance(ActiveLandmarks):
     # All of it
 
     def dense(self) -> JointCovariance:
-        """Return the same with all landmarks in P, which the observer has moved."""
+        """Return the covariance with all landmarks in P, after the observer has moved them."""
         self._apply()
         joint = self.marginal(np.arange(len(self._places)))
         self.P, self._observer.postponed = joint.P, None
@@ -132,11 +131,11 @@ class CompressedCovariance(ActiveLandmarks):
         return joint
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃ and of all ã_i."""
         self._apply()
         P = super().of_positions(points[self.active])
         P = P[np.ix_(self._x, self._x)]
-        # Errors of all others are those of their positions now, too.
+        # All other landmarks have the errors ã_i of their positions now, too.
         p = self._p
         T = self._all_turning(points[self.active])
         for panel in self._outside.panels:
@@ -170,7 +169,7 @@ class CompressedCovariance(ActiveLandmarks):
         return joint
 
     def _of_others(self, rows: IntArray, q: int) -> tuple[FloatArray, FloatArray]:
-        """Return covariances with q first entries of x (m, k, q), own (m, k, k) of ξ_i outside."""
+        """Return covariances of ξ_i outside P: with the first q entries of x, own (m, k, k)."""
         X, own, references = self._following.each(rows, self.P[self._entries, self._entries])
         T, p = self._turning(references), self._p
         to_state = X @ self.P[self._entries, :q]
@@ -179,7 +178,7 @@ class CompressedCovariance(ActiveLandmarks):
         return to_state + T @ self.P[:p, :q], own
 
     def _known_blocks(self, covariances: FloatArray) -> FloatArray:
-        """Return the covariances (m, …, …) of all that is estimated of known landmarks."""
+        """Return the covariances (m, …, …) of known landmarks, with all their columns."""
         k, blocks = self._axes.point, np.zeros((len(covariances), self._stride, self._stride))
         blocks[:, :k, :k] = covariances[:, :k, :k]
         blocks[:, np.arange(k, self._stride), np.arange(k, self._stride)] = self._unknown

@@ -1,4 +1,4 @@
-"""The covariance in a map that is taken to be exact: that of pose and calibration alone."""
+"""The covariance in a map that is taken to be exact: of pose and calibration alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ExactMapCovariance(JointCovariance):
         return None
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
-        """Add a motion's noise to that of the pose."""
+        """Add a motion's noise to the covariance of the pose."""
         motion.predict(self.P)
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
@@ -55,7 +55,7 @@ class ExactMapCovariance(JointCovariance):
         return PC[..., : self._p, :], C @ PC
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all together, (p, m k) and (m k, m k)."""
+        """Return :meth:`output` of all together, (p, m k) and (m k, m k)."""
         return self.output(C.reshape(-1, C.shape[2]), rows)
 
     def remove(self, rows: IntArray) -> None:
@@ -63,5 +63,5 @@ class ExactMapCovariance(JointCovariance):
         self._covariances = np.delete(self._covariances, rows, axis=0)
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃."""
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃."""
         super().set_pose(covariance, np.empty((0, 3)))

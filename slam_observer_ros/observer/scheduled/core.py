@@ -1,8 +1,8 @@
-"""The core of scheduled gains: what is estimated jointly, however many landmarks there are.
+"""The core of scheduled gains: few errors that are estimated jointly, in a map of any size.
 
-The core z = (ε, c, ã_1 … ã_K) are the errors of the pose, of the velocity's calibration, and of
-the K landmarks seen last; P is their covariance. What they know of each other is all here, and
-how other landmarks depend on them is in :mod:`.postponed_landmarks`.
+The core z = (ε, c, ã_1 … ã_K) has the errors of the pose, of the velocity's calibration, and of
+the K landmarks seen last; P is their covariance. How other landmarks depend on them is in
+:mod:`.postponed_landmarks`.
 
 When the core becomes z' = Φ z + noise, because the robot moves or one landmark replaces another,
 z = G z' + ζ with the regression G = P Φᵀ P'⁻¹, and ζ has the covariance V = P − G Φ P, here in
@@ -99,7 +99,7 @@ class Core:
         self.postponed.change_core(eye - T, np.zeros_like(T))
 
     def admit(self, rows: IntArray) -> None:
-        """Put landmarks (m,) just seen into the core, for those that were not seen for longest."""
+        """Put landmarks (m,) just seen into the core, in place of those unseen for longest."""
         # Which are new, and whose slots they get.
         seen = (self.rows[:, None] == rows).any(axis=1)
         self._unseen = np.where(seen, 0, self._unseen + 1)
@@ -120,7 +120,7 @@ class Core:
         self.postponed.hold(new, np.eye(len(Phi))[columns])
 
     def dismiss(self, rows: IntArray) -> None:
-        """Take those of the landmarks (m,) that are in the core out of it."""
+        """Take landmarks (m,) out of the core, as far as they are in it."""
         slots = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != EMPTY))
         if not len(slots):
             return

@@ -1,15 +1,15 @@
 """Landmarks that depend on a small core z, and follow it when they are next needed.
 
-The error of landmark i is ã_i = F_i z + η_i, with η_i ~ N(0, N_i) independent of all else. What is
-observed of the core, or of other landmarks, changes neither F_i nor N_i. It moves the estimate of
-z, by x, and with it that of the landmark, by F_i x. When the core itself becomes another one,
-z = G z' + ζ with ζ ~ N(0, V) independent of z', then F_i becomes F_i G, and N_i becomes
-N_i + F_i V F_iᵀ. A sequence of such changes is one such change:
+The error of landmark i is ã_i = F_i z + η_i, with η_i ~ N(0, N_i) independent of all else. An
+observation of the core, or of other landmarks, changes neither F_i nor N_i. It moves the estimate
+of z by x, and so the landmark by F_i x. When the core becomes another one, z = G z' + ζ with
+ζ ~ N(0, V) independent of z', then F_i becomes F_i G, and N_i becomes N_i + F_i V F_iᵀ. A sequence
+of such changes is one such change:
 
     (G, V, x) then (G', V', x')   =   (G G',  V + G V' Gᵀ,  x + G x')
 
 So nothing is done to a landmark out of view. Landmarks that were brought up to date together form
-a group, and what has changed since is composed for the group: O(1) each. Groups are merged like
+a group, and the changes since are composed once for the group: O(1) each. Groups are merged like
 the digits of a binary counter, so each is more than twice as large as the next, there are at most
 log₂ n of them, and a landmark takes part in O(log n) mergers until it is seen again.
 """
