@@ -18,10 +18,10 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
+from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.calibration import (
     Calibration,

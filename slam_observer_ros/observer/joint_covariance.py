@@ -20,11 +20,10 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
-from slam_observer_ros.observer.arrays import FilterArrays
+from slam_observer_ros.observer.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.observer.chart import Chart, sheared
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.motion import Motion
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ class JointCovariance:
     """P, kept in ``matrix``, and which of its columns are whose."""
 
     # Whether all landmarks are in P, and the rows of those that are, in its order: a correction
-    # moves these. See :mod:`.compressed_covariance`.
+    # moves these. See :class:`.CompressedCovariance`.
     is_dense = True
     active: IntArray | slice = slice(None)
 
@@ -329,7 +328,7 @@ class JointCovariance:
         self.P = self.chart.from_positions(covariance, points)
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃ and of all ã_i."""
         P = self.of_positions(points)
         P[: self._p] = P[:, : self._p] = 0.0
         P[: self._p, : self._p] = covariance

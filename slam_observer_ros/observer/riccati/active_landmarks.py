@@ -14,12 +14,11 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric
-from slam_observer_ros.observer.arrays import FilterArrays
+from slam_observer_ros.observer.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
-from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -15,13 +15,10 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.observer.arrays import flip_verdicts, SeenOrientations
 from slam_observer_ros.observer.gains import Errors, Gains, TagGains
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.orientations import (
-    flip_verdicts,
-    SeenOrientations,
-)
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import accepted, distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD

@@ -9,7 +9,7 @@ with R̂ D_i besides at the calibration of the sensor that saw it (:mod:`.calibr
 choice of the world's frame, which no observation can determine, is exactly in its null space: the
 covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
 X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
-in large maps less: :mod:`.compressed_covariance`.
+in large maps less: :class:`.CompressedCovariance`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,14 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import block_diagonal, solve_symmetric, with_blocks
+from slam_observer_ros.observer.arrays import UNKNOWN_RAD
 from slam_observer_ros.observer.chart import Chart
 from slam_observer_ros.observer.gains import Errors, OF_CONSTANT_GAINS
-from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.joint_covariance import JointCovariance
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.orientations import UNKNOWN_RAD
+from slam_observer_ros.observer.known_landmarks import anchor, KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
-from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
-from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
+from slam_observer_ros.observer.riccati.covariances import CompressedCovariance, ExactMapCovariance
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.observer.robust import AT_ONCE, observation_weights
 from slam_observer_ros.sensor_models.motion import Motion

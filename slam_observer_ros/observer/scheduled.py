@@ -14,8 +14,8 @@ the noise R_i of the observation, the gains of (30) and (31) become matrices
     l_i / k_i · dt = N_i (N_i + R_i)⁻¹,  δ_i = F_i Δ + N_i k_i (r_i + H_i Δ)
 
 where Δ is a step of all of z, and F_i ← F_i + N_i k_i H_i, N_i ← N_i − N_i k_i N_i. A landmark out
-of view keeps F_i and N_i, and follows by F_i Δ later (:mod:`.postponed_landmarks`). Where the core
-becomes another one (:mod:`.core`), what it no longer explains is added to each N_i as if it were
+of view keeps F_i and N_i, and follows by F_i Δ later (:mod:`.scheduled_core`). Where the core
+becomes another one (:class:`.Core`), what it no longer explains is added to each N_i as if it were
 its own. So P is not that of an exact filter, and not published. See docs/theory.md, Gain designs,
 which also has the origin: the compressed EKF and postponement.
 """
@@ -37,11 +37,10 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
 )
 from slam_observer_ros.observer.gains import Gains, OF_CONSTANT_GAINS, OF_JOINT_COVARIANCES
-from slam_observer_ros.observer.gauge import anchor
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.known_landmarks import anchor, KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import accepted, huber_weights, REWEIGHTINGS
-from slam_observer_ros.observer.scheduled.core import Core, regression
+from slam_observer_ros.observer.scheduled_core import Core, regression
 from slam_observer_ros.sensor_models.calibration import without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -178,7 +177,7 @@ class ScheduledGains(Gains):
         self._core.set_pose_error_covariance(covariance[self.axes.pose, self.axes.pose])
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
-        """Move pose and map to where known landmarks are, by γ, see :mod:`.gauge`."""
+        """Move pose and map to where known landmarks are, by γ, see :mod:`.known_landmarks`."""
         # All are up to date, and z is the pose (and calibration): ã_i = F_i (z − γ) + J_i γ + η_i.
         self._core.dismiss(self._core.rows)
         everything, p = np.arange(len(self._postponed)), self.axes.p
