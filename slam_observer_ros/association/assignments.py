@@ -52,8 +52,8 @@ the robot: then no other assignment has to be looked for.
 """
 
 UNCERTAIN = 3.0
-"""Prediction of an old landmark, over the sensor's noise, beyond which it is too uncertain to tell
-which of several ones a point is: points are held back from it.
+"""Deviation of an old landmark's prediction, over the sensor's, from which on it does not show
+which of several landmarks a point is of: such pairs are held back.
 """
 
 

@@ -1,6 +1,6 @@
 """Corrections of a local state x whose effect on errors η of other landmarks is postponed.
 
-Landmarks out of view do not move, and only x tells anything of their errors η. Let X = cov(η, x)
+Landmarks out of view do not move, and only x shows anything of their errors η. Let X = cov(η, x)
 at the instant from which on corrections are postponed. After a correction of x by the residual r
 of H x, with the covariance S,
 
