@@ -113,7 +113,7 @@ def turned_moment(
     k = 3 if q == 3 else 2
     scales, axes = np.linalg.eigh(of_turns)
     root = axes * np.sqrt(np.maximum(scales, 0.0))
-    # d_i = G z + what is independent of z, w = root z, z of unit variance.
+    # d_i = G z + a part that is independent of z, w = root z, z of unit variance.
     G = with_turns @ np.linalg.pinv(root).T
     others = (covariance - G @ G.T).reshape(-1, k, len(covariance))
     moment = np.zeros_like(covariance)
