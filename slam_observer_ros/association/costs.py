@@ -30,7 +30,7 @@ from slam_observer_ros.geometry.matrices import (
     with_blocks,
 )
 from slam_observer_ros.geometry.se3 import rigid_alignment
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, gated
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion

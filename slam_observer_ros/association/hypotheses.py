@@ -43,7 +43,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
-from slam_observer_ros.sensor_models.evidence import DelayEvidence
+from slam_observer_ros.sensor_models.integration import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation

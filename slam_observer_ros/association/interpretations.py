@@ -30,7 +30,7 @@ from slam_observer_ros.association.joint_compatibility import joint_cost
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, are_far, far_from_the_others
 from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
 from slam_observer_ros.state.state import State

@@ -21,8 +21,7 @@ from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
 from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Observer, Residuals
 from slam_observer_ros.sensor_models.calibration import (
     Calibration,
     SENSOR_STDDEVS,

@@ -23,7 +23,7 @@ from slam_observer_ros.geometry.matrices import (
 from slam_observer_ros.observer.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.observer.chart import Chart, sheared
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.sensor_models.motion import Motion
 
 if TYPE_CHECKING:

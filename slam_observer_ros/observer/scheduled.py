@@ -38,7 +38,7 @@ from slam_observer_ros.geometry.matrices import (
 )
 from slam_observer_ros.observer.gains import Gains, OF_CONSTANT_GAINS, OF_JOINT_COVARIANCES
 from slam_observer_ros.observer.known_landmarks import anchor, KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled_core import Core, regression
 from slam_observer_ros.sensor_models.calibration import without_sensor_calibration

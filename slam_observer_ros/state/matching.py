@@ -16,7 +16,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis
 from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.gains import Gains
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.step import LOG_ROOT_2_PI
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M

@@ -13,7 +13,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.arrays import SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.sensor_models.sensing import turn_sensitivity

@@ -21,7 +21,7 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.arrays import SymmetricMatrix
 from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.joint_covariance import JointCovariance
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.riccati.active_landmarks import ActiveLandmarks
 from slam_observer_ros.sensor_models.motion import Motion
 

@@ -19,7 +19,7 @@ from slam_observer_ros.observer.arrays import flip_verdicts, SeenOrientations
 from slam_observer_ros.observer.gains import Errors, Gains, TagGains
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 

@@ -26,7 +26,7 @@ from slam_observer_ros.observer.chart import Chart
 from slam_observer_ros.observer.gains import Errors, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import anchor, KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.covariances import CompressedCovariance, ExactMapCovariance
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
