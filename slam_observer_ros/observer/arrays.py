@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 UNKNOWN_RAD = 100.0
-"""Standard deviation about each axis of an orientation of which nothing is known."""
+"""Standard deviation of an unknown orientation about each axis."""
 
 FLIP_EVIDENCE = 9.0
-"""By how much less, as −2 ln of likelihood, what is seen must cost than its flipped twin."""
+"""By how much, as −2 ln of likelihood, an orientation must cost less than its flipped twin."""
 
 FLIP_DISTANCE = 3.0
 """Standard deviations of the sensor's noise within which a flip does no harm."""
@@ -32,7 +32,7 @@ FLIP_DISTANCE = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenOrientations:
-    """How the tags of m landmarks are turned that were seen at one instant, body frame."""
+    """Orientations of m tags that were seen at one instant, body frame."""
 
     rows: IntArray  # (m,) which landmarks
     Z: FloatArray  # (m, 3, 3) from the tag's own axes
@@ -55,7 +55,7 @@ class SeenOrientations:
 
 
 class LandmarkOrientations(LandmarkColumns):
-    """B̂_i of n landmarks in the frame of P°, all zero for those that have none (yet)."""
+    """Orientations B̂_i of n landmarks in the frame of P°; zero where there is none (yet)."""
 
     COLUMNS: ClassVar = {
         'B': (np.float64, (3, 3)),
@@ -67,7 +67,7 @@ class LandmarkOrientations(LandmarkColumns):
     # (n,) how often each was seen and accepted, and rejections in a row up to now
     counts: IntArray
     rejections: IntArray
-    map_sigmas: FloatArray  # (n,) standard deviations, rad, of those that are known by a map
+    map_sigmas: FloatArray  # (n,) standard deviations of orientations that a map has, rad
 
     @property
     def are_known(self) -> BoolArray:
@@ -88,7 +88,7 @@ class LandmarkOrientations(LandmarkColumns):
         self.B[rows] = 0.0
 
     def turn(self, rows: IntArray | slice, turns: FloatArray) -> None:
-        """Let those of landmarks (m,) become R_i B̂_i of ``turns`` R_i (m, 3, 3)."""
+        """Turn orientations of landmarks (m,) to R_i B̂_i, with ``turns`` R_i (m, 3, 3)."""
         self.B[rows] = turns @ self.B[rows]
 
     def count(self, rows: IntArray, accepted: BoolArray) -> None:
@@ -97,7 +97,7 @@ class LandmarkOrientations(LandmarkColumns):
         self.rejections[rows] = np.where(accepted, 0, self.rejections[rows] + 1)
 
     def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
-        """Return which of the rows (m,) are rejected so often that the first one was wrong."""
+        """Return which orientations (m,) were rejected so often that the first one was wrong."""
         needed = np.minimum(self.counts[rows] + 1, max_rejections)
         return np.asarray(self.rejections[rows] >= needed)
 
@@ -105,8 +105,8 @@ class LandmarkOrientations(LandmarkColumns):
 def flip_verdicts(evidence: FloatArray, apart: FloatArray) -> tuple[BoolArray, BoolArray]:
     """Return which orientations (m,) are less likely than their twins, and which hardly likelier.
 
-    ``evidence`` (m,) is by how much less they cost, as −2 ln of likelihood, ``apart`` (m,) how far
-    the twins are from them by the sensor's noise. An orientation as good as its twin is neither.
+    ``evidence`` (m,) says by how much less they cost, as −2 ln of likelihood; ``apart`` (m,) how
+    far their twins are from them, by the sensor's noise. Near its twin an orientation is neither.
     """
     differ = apart > FLIP_DISTANCE
     are_flipped = differ & (evidence < 0.0)
@@ -143,7 +143,7 @@ class SymmetricMatrix:
         return self._storage[: self._size, : self._size]
 
     def rows(self, numbers: IntArray) -> FloatArray:
-        """Return those of the ``numbers`` (q,), which are as well columns transposed: (q, N)."""
+        """Return the rows (q, N) with these ``numbers`` (q,); transposed they are columns."""
         # Of the storage, which is contiguous: of a view NumPy would copy all first.
         return self._storage.take(numbers, axis=0)[:, : self._size]
 

@@ -1,11 +1,11 @@
 """Landmarks that a map knows, and how they determine where a whole estimate lies in its frame.
 
-Pose and landmarks may be moved together by any rigid motion exp(γ) without changing what is
-observed: the gauge of SLAM. If nothing is known of γ beforehand, the error of an estimate, seen
-from the other frame, is x + G γ, with x ~ N(0, P) as before. Landmarks known there, up to noise of
-covariance R, differ by r = H (x + G γ) + noise. With S = H P Hᵀ + R and J = H G, generalised least
-squares give γ = Λ Jᵀ S⁻¹ r, Λ = (Jᵀ S⁻¹ J)⁻¹, and x follows as in a Kalman filter from what γ
-leaves of r. No large number has to stand for 'unknown'.
+A rigid motion exp(γ) of pose and landmarks together changes no observation: it is the gauge of
+SLAM. Seen from another frame, with γ unknown, the error of an estimate is x + G γ, where
+x ~ N(0, P) as before. Landmarks known there, up to noise of covariance R, differ by
+r = H (x + G γ) + noise. With S = H P Hᵀ + R and J = H G, generalised least squares give
+γ = Λ Jᵀ S⁻¹ r with Λ = (Jᵀ S⁻¹ J)⁻¹, and a Kalman filter gives x from the rest of r. So no large
+number has to stand for 'unknown'.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from slam_observer_ros.geometry.matrices import block_diagonal, definite, symmet
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownLandmarks:
-    """n landmarks of a map in one frame, of which t are tags with an orientation."""
+    """n landmarks of a map in one frame; t of them are tags with an orientation."""
 
     points: FloatArray  # (n, 3) metres
     covariances: FloatArray  # (n, 3, 3) of each position, m²
@@ -42,7 +42,7 @@ class KnownLandmarks:
         return tags_among(self.orientations)
 
     def select(self, rows: IntArray | BoolArray) -> KnownLandmarks:
-        """Return those at ``rows``."""
+        """Return the landmarks at ``rows``."""
         R, sigmas, joint = self.orientations, self.sigmas, self.joint
         return KnownLandmarks(
             self.points[rows],
@@ -115,11 +115,11 @@ def anchor(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the error x + G γ (N,) of an estimate, and the covariance (N, N) after it.
 
-    ``P`` (N, N), ``G`` (N, d), ``PH`` = P Hᵀ (N, q), ``S`` (q, q), ``J`` (q, d) are those of the
-    module's docstring, ``r`` (q,) is estimate minus known coordinates.
+    The module's docstring explains ``P`` (N, N), ``G`` (N, d), ``PH`` = P Hᵀ (N, q), ``S`` (q, q)
+    and ``J`` (q, d); ``r`` (q,) is the estimate minus the known coordinates.
     """
     S = S + JITTER_M2 * np.eye(len(r))
-    # γ by generalised least squares, then a Kalman filter's gain for what it leaves.
+    # γ by generalised least squares, then a Kalman filter's gain for the rest.
     information = gauge_information(J, S)
     gamma = np.linalg.solve(information, J.T @ _solve(S, r))
     K = _solve(S, PH.T).T

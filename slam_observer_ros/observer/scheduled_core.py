@@ -17,7 +17,7 @@ becomes N_i + F_i V F_iᵀ. A sequence of such changes is one such change:
     (G, V, x) then (G', V', x')   =   (G G',  V + G V' Gᵀ,  x + G x')
 
 So nothing is done to a landmark out of view. Landmarks that were brought up to date together form
-a group, and what has changed since is composed for the group: O(1) each. Groups are merged like
+a group, and the changes since are composed once for the group: O(1) each. Groups are merged like
 the digits of a binary counter, so each is more than twice as large as the next, there are at most
 log₂ n of them, and a landmark takes part in O(log n) mergers until it is seen again.
 """
@@ -241,7 +241,7 @@ class Core:
         self.postponed.change_core(eye - T, np.zeros_like(T))
 
     def admit(self, rows: IntArray) -> None:
-        """Put landmarks (m,) just seen into the core, for those that were not seen for longest."""
+        """Put landmarks (m,) just seen into the core, in place of those unseen for longest."""
         # Which are new, and whose slots they get.
         seen = (self.rows[:, None] == rows).any(axis=1)
         self._unseen = np.where(seen, 0, self._unseen + 1)
@@ -262,7 +262,7 @@ class Core:
         self.postponed.hold(new, np.eye(len(Phi))[columns])
 
     def dismiss(self, rows: IntArray) -> None:
-        """Take those of the landmarks (m,) that are in the core out of it."""
+        """Take landmarks (m,) out of the core, as far as they are in it."""
         slots = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != EMPTY))
         if not len(slots):
             return

@@ -21,6 +21,7 @@ from random_runs import (
 )
 from strategies import generators
 
+from slam_observer_ros.cli.simulate import run_simulation
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
@@ -29,7 +30,6 @@ from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.observer.scheduled import ScheduledGains
 from slam_observer_ros.observer.scheduled_core import CAPACITY, PostponedLandmarks
-from slam_observer_ros.runs.simulated_run import run_simulation
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
 

@@ -21,7 +21,7 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.arrays import SymmetricMatrix
 from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.joint_covariance import JointCovariance
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.riccati.active_landmarks import ActiveLandmarks
 from slam_observer_ros.sensor_models.motion import Motion
 
@@ -46,7 +46,7 @@ class ExactMapCovariance(JointCovariance):
         return None
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
-        """Add a motion's noise to that of the pose."""
+        """Add a motion's noise to the covariance of the pose."""
         motion.predict(self.P)
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
@@ -70,7 +70,7 @@ class ExactMapCovariance(JointCovariance):
         return PC[..., : self._p, :], C @ PC
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all together, (p, m k) and (m k, m k)."""
+        """Return :meth:`output` of all together, (p, m k) and (m k, m k)."""
         return self.output(C.reshape(-1, C.shape[2]), rows)
 
     def remove(self, rows: IntArray) -> None:
@@ -78,16 +78,16 @@ class ExactMapCovariance(JointCovariance):
         self._covariances = np.delete(self._covariances, rows, axis=0)
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃."""
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃."""
         super().set_pose(covariance, np.empty((0, 3)))
 
 
 class CompressedCovariance(ActiveLandmarks):
-    """What is known of all landmarks, wherever they are."""
+    """The covariance of all landmarks, active or not."""
 
     @property
     def references(self) -> FloatArray:
-        """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
+        """(n, 3) positions that errors are judged by: estimates of active landmarks, else y_i°."""
         points = self._observer.y_ref + self._observer.a
         for view in self._following.views(self._others):
             points[view.rows] = view.references
@@ -111,7 +111,7 @@ class CompressedCovariance(ActiveLandmarks):
         return with_pose, own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all together, (p, m k) and (m k, m k)."""
+        """Return :meth:`output` of all together, (p, m k) and (m k, m k)."""
         if (self._places[rows] >= 0).all():
             return super().outputs(C, rows)
         unique, at = np.unique(rows, return_inverse=True)
@@ -160,7 +160,7 @@ class CompressedCovariance(ActiveLandmarks):
         return self.marginal(every).of_landmarks(at, points, of_tags)
 
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags are with all that is postponed."""
+        """Return orientations ``B`` (m, 3, 3) of tags after all that is postponed."""
         every = np.tile(np.eye(3), (len(self._places), 1, 1))
         for view in self._following.views(np.unique(rows[self._places[rows] < 0])):
             every[view.rows] = view.turns
@@ -183,7 +183,7 @@ class CompressedCovariance(ActiveLandmarks):
     # All of it
 
     def dense(self) -> JointCovariance:
-        """Return the same with all landmarks in P, which the observer has moved."""
+        """Return the covariance with all landmarks in P, after the observer has moved them."""
         self._apply()
         joint = self.marginal(np.arange(len(self._places)))
         self.P, self._observer.postponed = joint.P, None
@@ -191,11 +191,11 @@ class CompressedCovariance(ActiveLandmarks):
         return joint
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃ and of all ã_i."""
         self._apply()
         P = super().of_positions(points[self.active])
         P = P[np.ix_(self._x, self._x)]
-        # Errors of all others are those of their positions now, too.
+        # All other landmarks have the errors ã_i of their positions now, too.
         p = self._p
         T = self._all_turning(points[self.active])
         for panel in self._outside.panels:
@@ -229,7 +229,7 @@ class CompressedCovariance(ActiveLandmarks):
         return joint
 
     def _of_others(self, rows: IntArray, q: int) -> tuple[FloatArray, FloatArray]:
-        """Return covariances with q first entries of x (m, k, q), own (m, k, k) of ξ_i outside."""
+        """Return covariances of ξ_i outside P: with the first q entries of x, own (m, k, k)."""
         X, own, references = self._following.each(rows, self.P[self._entries, self._entries])
         T, p = self._turning(references), self._p
         to_state = X @ self.P[self._entries, :q]
@@ -238,7 +238,7 @@ class CompressedCovariance(ActiveLandmarks):
         return to_state + T @ self.P[:p, :q], own
 
     def _known_blocks(self, covariances: FloatArray) -> FloatArray:
-        """Return the covariances (m, …, …) of all that is estimated of known landmarks."""
+        """Return the covariances (m, …, …) of known landmarks, with all their columns."""
         k, blocks = self._axes.point, np.zeros((len(covariances), self._stride, self._stride))
         blocks[:, :k, :k] = covariances[:, :k, :k]
         blocks[:, np.arange(k, self._stride), np.arange(k, self._stride)] = self._unknown
