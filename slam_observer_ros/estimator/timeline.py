@@ -1,4 +1,7 @@
-"""The instant that an estimate is of, and the velocities that lead on from there."""
+"""The instant of an estimate, and the velocities that lead on from there.
+
+A late observation is carried forward to that instant: to what would be seen from there.
+"""
 
 from __future__ import annotations
 
@@ -6,28 +9,32 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
+import numpy as np
+
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MeasuredVelocity, ObservationEvent, VelocityBlock
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.state.covariances import of_moved_pose
-from slam_observer_ros.state.late_observation import carried_forward
+from slam_observer_ros.state.matching import point_covariances
 from slam_observer_ros.state.state import State
 
 OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
-"""Called with velocities, and with the two stamps between which they lead, nanoseconds."""
+"""Called with velocities, and with the stamps of a motion along them: start and end, ns."""
 
 MAX_PENDING_VELOCITIES = 128
 """Velocities that may wait for an observation before the state is moved on without one."""
 
 
 class Moved(Protocol):
-    """What is moved along the velocities: hypotheses; ``best`` is the most likely one."""
+    """Hypotheses as the timeline moves them along the velocities."""
 
     @property
     def best(self) -> State:
@@ -52,17 +59,16 @@ class Timeline:
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
         self.stamp_ns: int | None = None  # of the last event used; None before the first
         self.state_ns: int | None = None  # of the hypotheses: velocities since are pending
-        # A delay, and beyond it half of what velocities are averaged over to estimate it.
+        # A delay, and half of the time over which velocities are averaged to estimate it.
         self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
         self._pending = 0
-        # Whether what was in force at the last event's stamp could not be changed any more.
-        self.was_late = False
-        self._in_force_ns = 0  # no velocity of before can change what is in force
+        self.was_late = False  # the last event came after its instant had been passed
+        self._in_force_ns = 0  # before this stamp velocities can't be changed any more
         self._newest_ns: dict[str, int] = {}
 
     def parts(self, velocities: VelocityBlock) -> Iterator[MeasuredVelocity]:
-        """Yield velocities as :meth:`append` takes them, each time those that are next."""
+        """Yield velocities in parts as :meth:`append` takes them."""
         if velocities.stamp_ns <= max(self.stamp_ns or -1, self._in_force_ns - 1):
             yield from velocities.events()
             return
@@ -72,7 +78,7 @@ class Timeline:
         yield velocities
 
     def _note_stamps(self, first_ns: int, last_ns: int) -> int:
-        """Note the stamps of what is about to be used; return ``state_ns``."""
+        """Note the stamps of an event that is about to be used; return ``state_ns``."""
         if self.stamp_ns is None or last_ns > self.stamp_ns:
             self.stamp_ns = last_ns
         if self.state_ns is None:
@@ -82,10 +88,10 @@ class Timeline:
     def append(self, measured: MeasuredVelocity) -> bool:
         """Add velocities; return whether they are in force: an angular one waits for a linear one.
 
-        A late one, which is no block, leads on from where velocities can still be changed. Raise
+        A single late one counts from the first stamp on where velocities can be changed. Raise
         :exc:`InvalidEventError` if a newer one of its kind was used before it (``'too_late'``).
         """
-        # Each kind in stamp order, and none before what is already in force.
+        # Each kind in stamp order, and none before velocities that can't be changed.
         first_ns = last_ns = measured.stamp_ns
         count = 1
         if isinstance(measured, VelocityBlock):
@@ -132,7 +138,7 @@ class Timeline:
             self._advance(self.stamp_ns)
 
     def _advance(self, stamp_ns: int) -> None:
-        """Move the hypotheses, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
+        """Move the hypotheses on from ``state_ns`` to ``stamp_ns``, never back."""
         self._pending = 0
         start_ns = self.state_ns
         if start_ns is None or stamp_ns <= start_ns:
@@ -182,3 +188,49 @@ class Timeline:
             return se3.inverse(self.motion(end_ns, start_ns))
         calibration = self._hypotheses.best.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
+
+
+def carried_forward(
+    state: State, event: ObservationEvent, velocities: VelocityHistory, state_ns: int
+) -> ObservationEvent:
+    """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since ``event``.
+
+    Its points are as uncertain as any seen from there, and as that motion makes them. Its
+    error is one and the same for all m, but is given to each as its own: m would average it
+    down. Where velocities of landmarks are estimated, v may be anything that they may be.
+    """
+    # The motion of the robot since then, and that of the landmarks.
+    interval = (event.stamp_ns, state_ns)
+    lag_s, calibration = to_s(state_ns - event.stamp_ns), state.calibration
+    back = se3.inverse(transition(velocities, calibration, *interval))
+    shifts = _landmark_velocities(state, event, state.observer.A @ back) * lag_s
+    points = event.points + shifts
+    # The sensor with it, so that it was measured from as far.
+    sensor = shifts if event.sensor is None else event.sensor + shifts
+    shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
+    moved = shifted.moved(back)
+    # What both add to the noise.
+    Q = transition_covariance(velocities, calibration, state.motion_noise, *interval)
+    C = back[:3, :3] @ SPATIAL.output_matrix(points)
+    shared = len(points) * C @ Q @ transpose(C)
+    rows = state.landmarks.rows_of(event.ids)
+    own = (lag_s * state.landmark_velocity_stddev) ** 2 * np.eye(3)
+    moved = replace(moved, covariances=point_covariances(state, moved, rows) + shared + own)
+    if moved.orientations is None:
+        return moved
+    R, turns = (
+        back[:3, :3],
+        state.observation_noise.orientation_covariances(moved, moved.orientations),
+    )
+    turns = turns + len(points) * R @ Q[:3, :3] @ R.T
+    return replace(moved, orientation_covariances=turns)
+
+
+def _landmark_velocities(state: State, event: ObservationEvent, A: FloatArray) -> FloatArray:
+    """Return how the landmarks (m, 3) seen move, m/s, along the axes of the body at Â = ``A``."""
+    velocities = np.zeros_like(event.points)
+    if not state.landmark_velocity_stddev:  # not estimated: as the sensor says
+        return velocities if event.velocities is None else event.velocities
+    rows = state.landmarks.rows_of(event.ids)
+    velocities[rows >= 0] = state.observer.u[rows[rows >= 0]]
+    return se3.rotate(se3.inverse(A), velocities)

@@ -1,4 +1,7 @@
-"""Matching an observation with a state: which landmarks it is of, residuals, their noise."""
+"""Matching an observation with a state: which landmarks it is of, residuals, their noise.
+
+And what a filter expects residuals to be, and how far off they are by that.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis
+from slam_observer_ros.observer.arrays import SeenOrientations
+from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.observer.observer import Residuals
+from slam_observer_ros.observer.step import LOG_ROOT_2_PI
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
@@ -24,11 +31,11 @@ SAME_POSITION = 4.0
 class MatchedObservation:
     """An observation, with the landmarks of a state that its points are of."""
 
-    event: ObservationEvent  # where nothing is added to the map, without what is not in it
-    rows: IntArray  # (m,) row of the landmark that each point is, −1 where it is new
+    event: ObservationEvent  # where mapping is over, without points of unknown landmarks
+    rows: IntArray  # (m,) row of each point's landmark, −1 where it is new
     covariances: FloatArray  # (m, 3, 3) of the points, body frame, m²
-    known: ObservationEvent  # the part of it whose landmarks are not new
-    residuals: Residuals  # of that part
+    known: ObservationEvent  # the points of known landmarks …
+    residuals: Residuals  # … and theirs
     left_out: int  # points of the observation that are not in ``event``
 
 
@@ -52,7 +59,7 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
 
 
 def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
-    """Return an observation as it is by the calibration of its sensor, unless it is already."""
+    """Return an observation corrected by the calibration of its sensor, if it is not yet."""
     calibration = state.calibration
     if not calibration.corrects_points or event.sensed is not None:
         return event
@@ -62,7 +69,7 @@ def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
 
 
 def corrected_again(state: State, event: ObservationEvent) -> ObservationEvent:
-    """Return an observation as it is by what a correction has made of the calibration."""
+    """Return an observation by the present calibration, which a correction has changed."""
     return sensing.corrected_again(state.calibration, event)
 
 
@@ -79,7 +86,7 @@ def sensitivity(
 
 
 def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
-    """Return the part of an observation that is of known landmarks, and their rows."""
+    """Return the points of known landmarks in an observation, and their rows."""
     rows = state.landmarks.rows_of(event.ids)
     is_known = rows >= 0
     return event.select(is_known), rows[is_known]
@@ -114,7 +121,7 @@ def keyframe_of(
     rows: IntArray,
     orientations: SeenOrientations | None = None,
 ) -> Keyframe:
-    """Return what is needed to linearise an observation again, after its correction."""
+    """Return an observation, after its correction, as it is kept to be linearised again."""
     lines_of_sight, noise = _lines_of_sight(state, event, rows), state.observation_noise
     is_stated = event.covariances is not None
     stated = noise.covariances(event, lines_of_sight) if is_stated else None
@@ -157,9 +164,10 @@ def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> 
 
 
 def rejected_before(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
-    """Return which known landmarks (m,) in it were rejected before where they are seen now.
+    """Return which known landmarks (m,) were rejected before where they are seen now.
 
-    And how far (m, 3) all of them are from their last rejected position, metres, reference frame.
+    Return how far (m, 3) all of them are from where they were rejected last, too: metres,
+    reference frame.
     """
     rows = matched.residuals.rows
     points, tolerances_m = positions(state, matched.known)
@@ -177,7 +185,7 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     landmarks, settings = state.landmarks, state.settings
     if not len(landmarks):
         return event.lines_of_sight
-    # A landmark that is new, in doubt, or may itself be an outlier is where it was measured.
+    # A new or doubtful landmark, and one that may be an outlier, is where it was measured.
     is_confirmed = landmarks.counts.take(rows, mode='wrap') >= settings.confirmations
     in_doubt = landmarks.in_doubt(rows, settings.max_rejections)
     is_sure = (rows >= 0) & is_confirmed & ~in_doubt
@@ -185,3 +193,47 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     if np.count_nonzero(is_sure) < len(rows):
         points = np.where(is_sure[:, None], points, event.points)
     return points if event.sensor is None else points - event.sensor
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Residuals of m points before a correction, metres, and what was expected of them."""
+
+    r: FloatArray  # (m, k)
+    distances: FloatArray  # (m,) Mahalanobis distance of each
+    R: FloatArray  # (m, k, k) the part of their covariance that comes from the points, m²
+    S: FloatArray  # (m k, m k) their joint covariance, m²; empty if it is not known
+
+    @classmethod
+    def of(cls, gains: Gains, residuals: Residuals) -> Expected:
+        """Ask gains, before they correct the state."""
+        r, R = residuals.on(gains.axes)
+        if gains.errors is not None and len(r):
+            S = gains.errors.innovation_covariance(residuals)
+            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), R, S)
+        distances = gains.distances(residuals) if len(r) else np.empty(0)
+        return cls(r, distances, R, np.empty((0, 0)))
+
+    def judge(self, weights: FloatArray, shares: FloatArray) -> NormalisedInnovation:
+        """Return how far off the residuals are, given the weights (m,) of the correction.
+
+        ``shares`` (m,) is what each is worth of an observation with new errors.
+        """
+        (m, k), used = self.r.shape, weights > 0.0
+        nis, log_densities = None, np.full(m, -np.inf)
+        if len(self.S) and used.any():
+            rows = np.flatnonzero(np.repeat(used, k))
+            L = cholesky(self.S[np.ix_(rows, rows)])
+            # One after the other, each as those before it have it: the product is that of all.
+            white = np.linalg.solve(L, self.r.ravel()[rows])
+            nis = float(white @ white)
+            each = 0.5 * white**2 + np.log(np.diagonal(L)) + LOG_ROOT_2_PI
+            log_densities[used] = -each.reshape(-1, k).sum(axis=1)
+        return NormalisedInnovation(
+            self.distances,
+            weights,
+            nis,
+            0 if nis is None else k * int(np.count_nonzero(used)),
+            log_densities,
+            shares,
+        )

@@ -1,18 +1,26 @@
-"""One step of the observer: what an observation changes in a state."""
+"""One step of the observer: what an observation changes in a state.
+
+Orientations of tags that are seen are used before their positions, as a position is linear in the
+heading's error only if that is small: a tag's orientation corrects it directly.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.arrays import SeenOrientations
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
-from slam_observer_ros.state.expected import Expected
+from slam_observer_ros.sensor_models.sensing import turn_sensitivity
 from slam_observer_ros.state.matching import (
     corrected_again,
     enter,
+    Expected,
     is_contradiction,
     keyframe_of,
     mapped,
@@ -22,11 +30,6 @@ from slam_observer_ros.state.matching import (
     sensitivity,
 )
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.tag_orientations import (
-    correct_by_orientations,
-    seen_orientations,
-    take_over_orientations,
-)
 from slam_observer_ros.state.usual import Outcome
 
 
@@ -77,7 +80,7 @@ def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> No
 
 
 def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Relinearise, if it is time; relocate landmarks in doubt that this does not explain."""
+    """Relinearise, if it is time; relocate doubtful landmarks that this does not explain."""
     # After the correction it is known better where they were seen.
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     some_are = bool(np.count_nonzero(in_doubt))
@@ -97,7 +100,7 @@ def _drop_history_if_full(state: State, matched: MatchedObservation) -> None:
 
 
 def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEvent, IntArray]:
-    """Add new landmarks; return the part of the observation that is mapped now, and its rows."""
+    """Add new landmarks; return the points of landmarks in the map by now, and their rows."""
     event, rows = matched.event, matched.rows
     if len(matched.known.ids) == len(rows):
         return event, rows
@@ -108,7 +111,7 @@ def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEven
 
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Relocate landmarks in doubt that are still far off; return ids of those that have moved."""
+    """Relocate doubtful landmarks that are still far off; return ids of landmarks that moved."""
     event = corrected_again(state, event)
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
@@ -138,7 +141,7 @@ def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> No
 def disbelieve(state: State, event: ObservationEvent) -> None:
     """Count points as rejected although the gate lets them pass.
 
-    Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
+    Landmarks that become doubtful by that are forgotten, and are new when they are seen next.
     """
     event, rows = mapped(state, event)  # one may have made room
     state.landmarks.reject(rows, *positions(state, event))
@@ -155,3 +158,112 @@ def _rows_to_forget(state: State, matched: MatchedObservation) -> IntArray:
         return np.empty(0, dtype=np.int64)
     unseen = state.landmarks.unseen_since(matched.event.stamp_ns)
     return np.sort(unseen[~np.isin(unseen, matched.rows)][:excess])
+
+
+_NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
+
+
+def correct_by_orientations(state: State, matched: MatchedObservation) -> MatchedObservation:
+    """Correct a state by known orientations; return the observation with its residuals since.
+
+    Of points that are too far off to be used orientations are not, either. An orientation that is
+    rejected leaves its landmark a point, as seen this time.
+    """
+    gains, event, rows = state.gains.tags, matched.known, matched.residuals.rows
+    if gains is None or event.orientations is None or not len(rows):
+        return matched
+    gains.learn_motion_noise(matched.residuals)
+    tags, gate = state.observer.orientations, state.settings.rejection_threshold
+    are_near = accepted(state.gains.distances(matched.residuals), gate)
+    seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
+    if not len(seen.rows):
+        return matched
+    before = state.observer.A.copy()
+    weights, are_unclear = gains.correct_by_orientations(seen)
+    if state.relinearisation is not None:
+        state.relinearisation.note_correction(before, state.observer.A)
+    judged = ~are_unclear
+    tags.count(seen.rows[judged], weights[judged] > 0.0)
+    state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
+    covariances = matched.covariances[matched.rows >= 0]
+    event = corrected_again(state, event)
+    residuals = residuals_of(state, event, rows, covariances)
+    return replace(matched, known=event, residuals=residuals)
+
+
+def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray) -> None:
+    """Take over orientations of landmarks ``rows`` (m,) that have none yet, or a wrong one.
+
+    An orientation is wrong if it was rejected, all in a row, more often than it was seen, or
+    ``max_rejections`` times.
+    """
+    gains, tags, Z = state.gains.tags, state.observer.orientations, event.orientations
+    if gains is None or Z is None or state.observer.is_exact:
+        return
+    in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
+    is_used = state.landmarks.rejections[rows] == 0
+    event = corrected_again(state, event)
+    Z = Z if event.orientations is None else event.orientations
+    seen = _seen(state, event, rows, Z, is_used & (in_doubt | ~tags.are_known[rows]))
+    if not len(seen.rows):
+        return
+    replaced = seen.rows[tags.are_known[seen.rows]]
+    if state.relinearisation is not None and len(replaced):
+        state.relinearisation.forget_orientations(replaced)
+    gains.add_orientations(seen)
+
+
+def seen_orientations(
+    state: State, event: ObservationEvent, rows: IntArray
+) -> SeenOrientations | None:
+    """Return how tags of landmarks ``rows`` (m,) are turned, zero for none; None of points."""
+    if event.orientations is None:
+        return None
+    seen = _all_seen(state, event, rows, event.orientations)
+    if event.sensed is None or event.sensed.orientations is None:
+        return seen
+    # As the sensor showed them: its calibration will have changed by then.
+    Z = event.sensed.orientations
+    return replace(seen, Z=Z, flipped=flipped(Z, event.sensed.arms))
+
+
+def flipped(Z: FloatArray, lines_of_sight: FloatArray) -> FloatArray:
+    """Return the other orientations (m, 3, 3) in which tags look nearly the same.
+
+    Mirrored in depth, a plane's image is the same but for perspective; so they are hard to
+    distinguish for tags that are small or nearly frontal. A tag is in its x-y plane.
+    """
+    squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)[:, None, None]
+    outer = lines_of_sight[:, :, None] * lines_of_sight[:, None, :]
+    mirror = np.eye(3) - 2.0 * outer / np.maximum(squared, np.finfo(np.float64).tiny)
+    twins: FloatArray = mirror @ Z @ _NORMAL_TURNED
+    return twins
+
+
+def _seen(
+    state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray, are_wanted: BoolArray
+) -> SeenOrientations:
+    """Return the wanted (m,) orientations in an observation, where it has one."""
+    return _all_seen(state, event, rows, Z).select(are_wanted & Z.any(axis=(1, 2)))
+
+
+def _all_seen(
+    state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray
+) -> SeenOrientations:
+    """Return the orientations (m, 3, 3) in an observation, with their noise."""
+    noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
+    dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    twins, D = flipped(Z, event.lines_of_sight), turn_sensitivity(state.calibration, event)
+    if D is not None:
+        D = state.observer.A[:3, :3] @ D
+    return SeenOrientations(rows, Z, twins, noise, dt_s, D)
+
+
+def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:
+    """Return the orientations (m, 3, 3) expected of tags; of an unknown one, as it is seen.
+
+    By the seen orientation, a tag that only seems to be tilted would be trusted too much.
+    """
+    tags = state.observer.orientations
+    expected: FloatArray = state.observer.A[:3, :3].T @ tags.B[rows]
+    return np.where(tags.are_known[rows][:, None, None], expected, Z)

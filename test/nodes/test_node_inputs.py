@@ -37,7 +37,7 @@ from slam_observer_ros.messages.poses import decode_twist, ODOMETRY
 from slam_observer_ros.nodes.intake import chosen_inputs
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 IMU = 'sensor_msgs/msg/Imu'
