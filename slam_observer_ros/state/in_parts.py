@@ -18,7 +18,6 @@ from slam_observer_ros.state.matching import (
     enter,
     is_contradiction,
     keyframe_of,
-    point_covariances,
     positions,
 )
 from slam_observer_ros.state.state import State
@@ -60,7 +59,6 @@ def _in_parts(
         return None
     shown, used = corrected(state, event), known.copy()  # by the calibration before the step
     new = shown.select(~known)
-    noise = point_covariances(state, new, rows[~known])
     of_used = None
     if np.count_nonzero(known):
         if of_all is None:
@@ -78,7 +76,7 @@ def _in_parts(
         state.landmarks.reject(rows[rejected], *positions(state, shown.select(rejected)))
         state.counts['rejected_landmark'] += int(np.count_nonzero(rejected))
     if len(new.ids):
-        enter(state, new, noise)
+        enter(state, new, state.observation_noise.covariances(new))
     past = state.relinearisation
     if past is not None and past.is_active:
         past.add(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)), in_doubt=False)
