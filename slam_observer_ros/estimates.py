@@ -58,15 +58,16 @@ class NormalisedInnovation:
 class Update:
     """The state at ``stamp_ns``, right after an observation of m known landmarks was used.
 
-    Residuals are those before the correction, along the world's axes; the rejected ones were too
-    far off to be used. ``lyapunov`` is L (34) of them all; k_i is ``gain_k`` whatever the gains.
-    Those of ``moved_ids`` are taken to be somewhere else from now on.
+    Residuals are from before the correction, along the axes that the world had then: it may have
+    been the robot's own frame, and the observation have shown where that lies in a loaded map. The
+    rejected ones were too far off to be used. ``lyapunov`` is L (34) of all; k_i is ``gain_k``
+    whatever the gains. Landmarks ``moved_ids`` are taken to be somewhere else from now on.
     ``innovation`` is None unless the estimator was asked for it.
     """
 
     stamp_ns: int
     pose: FloatArray  # (4, 4) body to world
-    ids: IntArray  # (m,)
+    ids: IntArray  # (m,) landmarks that were known before
     residuals: FloatArray  # (m, 3) r_i, metres
     rejected: BoolArray  # (m,)
     lyapunov: float

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 import logging
 import math
 import time
@@ -33,13 +34,10 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityBlock,
 )
-from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.loop_closure import LoopClosure
-from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import checked, table
-from slam_observer_ros.state.usual import Outcome
 
 logger = logging.getLogger(__name__)
 
@@ -314,19 +312,34 @@ class Estimator(Estimate):
         event = self._timeline.synchronise(usable)
         if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
             self._placement.doubt(*self.uncertain_pose)
-        outcome = self._hypotheses.observe(event)
+        update = self._hypotheses.observe(event)
+        self._counts['observation'] += 1
+        self._counts['late_observation'] += self._timeline.was_late
+        may_have_moved = self._follow_up(event, update)
+        self._warn_of(event, update)
+        if may_have_moved:
+            update = replace(update, pose=self._state.observer.pose)
+        self.last_update = update
+        if self._on_update is not None:
+            self._on_update(update)
+
+    def _follow_up(self, event: ObservationEvent, update: Update) -> bool:
+        """Find the pose in a map, close a loop, or start again, as an observation gives reason.
+
+        Return whether that may have moved the robot.
+        """
         if self._localiser.maps:
-            self._placement.localise(event, outcome)
-        if np.count_nonzero(event.ids == UNKNOWN_ID):
+            self._placement.localise(event, update)
+        some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
+        if some_are_unknown:
             is_alone = len(self._hypotheses) == 1
             if self._loop_closure.follow(self._state, event.stamp_ns, is_alone=is_alone):
                 self._hypotheses.prune_to_best()
-        self._counts['observation'] += 1
-        self._counts['late_observation'] += self._timeline.was_late
-        self._warn_of(event, outcome)
-        self.last_update = self._update(event.stamp_ns, outcome)
-        if self._on_update is not None:
-            self._on_update(self.last_update)
+        distance_m = math.hypot(*self._state.observer.A[:3, 3].tolist())
+        has_diverged = not distance_m <= DIVERGED_M  # nor is what is no number
+        if has_diverged:
+            self._start_again(distance_m)
+        return bool(self._localiser.maps) or some_are_unknown or has_diverged
 
     def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""
@@ -338,35 +351,19 @@ class Estimator(Estimate):
         self._counts['diverged'] += 1
         self._placement.start(None)
 
-    def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
-        """Warn of what is wrong with an observation, its outcome, or the map."""
+    def _warn_of(self, event: ObservationEvent, update: Update) -> None:
+        """Warn of an observation, of what it did, or of the map if something is wrong."""
         warnings, state = self._warnings, self._state
         limit = self.settings.max_landmarks if state.is_mapping else 0
         if 0 < limit < len(event.ids):
             warnings.warn('more_than_max', count=len(event.ids), limit=limit)
-        if len(outcome.moved_ids):
-            warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
+        if len(update.moved_ids):
+            warnings.moved_landmarks(update.moved_ids, event.stamp_ns)
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
         is_dense = state.joint is not None and state.joint.is_dense
         warnings.large_map(len(state.landmarks), limit, is_dense)
-        distance_m = math.hypot(*state.observer.A[:3, 3].tolist())
-        if not distance_m <= DIVERGED_M:  # nor is what is no number
-            self._start_again(distance_m)
-
-    def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
-        observer = self._state.observer
-        return Update(
-            stamp_ns,
-            observer.pose,
-            outcome.ids,
-            se3.rotate(observer.reference_pose, outcome.residuals),
-            outcome.rejected,
-            lyapunov(self.settings.gain_k, outcome.residuals),
-            outcome.moved_ids,
-            outcome.innovation,
-        )
 
     def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""

@@ -8,10 +8,11 @@ from copy import copy
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import NormalisedInnovation, Smoothed, Update
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
+from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.observer.gains import Errors, Gains
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
@@ -162,6 +163,28 @@ class State:
             self.relinearisation.move(motion)
         if motion.at_ends is not None:
             self._end_velocity = motion.at_ends[1]
+
+    def update(
+        self,
+        stamp_ns: int,
+        ids: IntArray,
+        r: FloatArray,
+        rejected: BoolArray,
+        moved_ids: IntArray,
+        innovation: NormalisedInnovation | None,
+    ) -> Update:
+        """Return what an observation of m landmarks has done, given residuals r (m, 3) before."""
+        observer = self.observer
+        return Update(
+            stamp_ns,
+            observer.pose,
+            ids,
+            se3.rotate(observer.reference_pose, r),
+            rejected,
+            lyapunov(self.settings.gain_k, r),
+            moved_ids,
+            innovation,
+        )
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot to ``pose`` (4, 4), body to world, uncorrelated with the map from now on.

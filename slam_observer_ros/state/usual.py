@@ -7,14 +7,13 @@ Of large maps only those landmarks are read that are active, which those seen ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import NormalisedInnovation
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import NormalisedInnovation, Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis
 from slam_observer_ros.geometry.sensor_mounting import Sensed
@@ -42,18 +41,6 @@ MOST_WORK = 1e7
 """Multiplications of a correction of P beyond which BLAS, in the general way, takes less time."""
 
 _NO_ENTRIES, NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What an observation did to a state."""
-
-    ids: IntArray  # (m,) ids of the landmarks seen that were known before
-    residuals: FloatArray  # (m, 3) before the correction, metres, reference frame
-    rejected: BoolArray  # (m,) which of them were too far off to be used
-    moved_ids: IntArray  # ids of landmarks that it showed to have moved
-    innovation: NormalisedInnovation | None = None
-    expected: Expected | None = None  # of those that were used, if it was asked for
 
 
 def advance(
@@ -145,19 +132,14 @@ class Corrected(NamedTuple):
     factors: Factors | None  # what was learnt of the noise of the motion
 
 
-def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Outcome:
-    """Keep a keyframe of an observation all of which has corrected a state; return its outcome."""
+def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Update:
+    """Keep a keyframe of an observation that has corrected a state by all its points."""
     past, out = state.relinearisation, corrected.out
     if past is not None and past.is_active:
         past.add(keyframe(state, event, corrected), in_doubt=False)
-    return Outcome(
-        event.ids,
-        out.r,
-        np.zeros(len(event.ids), dtype=np.bool_),
-        NO_IDS,
-        innovation(state, out),
-        expected(state, out),
-    )
+    none_rejected = np.zeros(len(event.ids), dtype=np.bool_)
+    judged = innovation(state, out)
+    return state.update(event.stamp_ns, event.ids, out.r, none_rejected, NO_IDS, judged)
 
 
 def takes(state: State, event: ObservationEvent) -> bool:
