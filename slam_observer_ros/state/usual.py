@@ -27,6 +27,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Observed,
     Seen,
 )
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.covariances import ExactMapCovariance
 from slam_observer_ros.observer.robust import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
@@ -47,15 +48,15 @@ def advance(
     state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
 ) -> FloatArray | None:
     """Move a state on between two stamps (27); return the variances (6,) of the motion by axis."""
-    x = _estimate(state)
-    if x is None:
+    joint = state.joint
+    if joint is None or not _is_at_rest(state, joint):
         return None
+    x = _estimate(state, joint)
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    calibration, joint = state.calibration, state.joint
-    if joint is not None:
-        joint.note_motion()
+    calibration = state.calibration
+    joint.note_motion()
     if state.relinearisation is not None and state.relinearisation.is_active:
         history = state.relinearisation.history
         history.begin(x.A)
@@ -103,7 +104,7 @@ def _led_to(
     # Landmarks have no part in it.
     now = joint.of_robot
     P, p, figures = now.copy(), axes.p, state.motion_noise.figures
-    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, len(P), len(P))
+    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, (len(P), len(P), joint.chart.stride))
     A, covariances = np.empty((len(ends_ns), 4, 4)), np.zeros((len(ends_ns), 6, 6))
     out = _room_for_motion(state)
     for row, (known, end_ns) in enumerate(zip(velocities, ends_ns, strict=True)):
@@ -147,13 +148,15 @@ def takes(state: State, event: ObservationEvent) -> bool:
 
     Made at the state's instant, by a sensor that is known.
     """
-    calibration = state.calibration
+    calibration, joint = state.calibration, state.joint
     return (
         event.velocities is None
         and event.orientations is None
         and event.sensed is None  # late, and carried forward
         and not (calibration.corrects_points and event.sensor_frame not in calibration.sensors)
-        and _is_of_points(state)
+        and joint is not None
+        and _is_at_rest(state, joint)
+        and joint.chart.stride == state.axes.point
     )
 
 
@@ -173,9 +176,7 @@ def correct(
     if joint is None or not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
         return None
     joint.activate(rows)
-    x, places = _estimate(state), joint.places(rows)
-    if x is None:
-        return None
+    x, places = _estimate(state, joint), joint.places(rows)
     seen = _seen(state, event, places)
     settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
     factors = noise.flat() if of_all is None else None
@@ -223,35 +224,26 @@ def correct(
     return Corrected(status, rows, seen, out, factors)
 
 
-def _estimate(state: State) -> Estimate | None:
-    """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
-    joint, observer = state.joint, state.observer
-    if joint is None or not _is_of_points(state):
-        return None
-    matrix, active = joint._matrix, joint.active
+def _estimate(state: State, joint: JointCovariance) -> Estimate:
+    """Return what is estimated as plain arrays, of landmarks that :func:`_is_at_rest`."""
+    observer, matrix, active = state.observer, joint._matrix, joint.active
     return _estimate_of(
         state,
         observer.y_ref[active],
         observer.a[active],
         matrix._storage,
-        matrix._size,
-        joint.first,
+        (matrix._size, joint.first, joint.chart.stride),
     )
 
 
-def _is_of_points(state: State) -> bool:
-    """Return whether what is estimated is a map of points at rest, and no more of them."""
-    joint = state.joint
-    return (
-        joint is not None
-        and not isinstance(joint, ExactMapCovariance)
-        and joint.chart.stride == state.axes.point
-        and not state.observer.have_moved
-    )
+def _is_at_rest(state: State, joint: JointCovariance) -> bool:
+    """Return whether landmarks are estimated, and are at rest."""
+    is_exact = isinstance(joint, ExactMapCovariance)
+    return not (is_exact or joint.chart.velocity or state.observer.have_moved)
 
 
 def _estimate_of(
-    state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, size: int, first: int
+    state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, sizes: tuple[int, int, int]
 ) -> Estimate:
     calibration = state.calibration
     return Estimate(
@@ -259,8 +251,7 @@ def _estimate_of(
         y_ref,
         a,
         P,
-        size,
-        first,
+        *sizes,
         state.settings.two_d_mode,
         calibration.rates,
         calibration.velocity_places,
