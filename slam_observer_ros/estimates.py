@@ -94,7 +94,7 @@ class CalibrationEstimate:
 
     @property
     def for_people(self) -> tuple[float, str]:
-        """The factor from ``unit`` to that which people read, and that: degrees for radians."""
+        """The factor to the unit that people read, and that unit: degrees for radians."""
         if not self.unit.startswith('rad'):
             return 1.0, self.unit
         return math.degrees(1.0), self.unit.replace('rad', '°', 1)
@@ -111,11 +111,11 @@ class CalibrationEstimate:
 
 @dataclass(frozen=True, slots=True)
 class MotionFactor:
-    """How noisy the odometry is over what is stated: in ``'turning'`` or in ``'driving'``.
+    """Noise of the odometry over the stated noise: in ``'turning'`` or in ``'driving'``.
 
-    Factors are of standard deviations: ``factor`` was found, and ``applied`` is in force.
-    ``deviation`` is that of the logarithm of ``factor``, and ``proposed`` are the settings that
-    state what was found.
+    Factors are of standard deviations: ``factor`` was found, and ``applied`` is in force. The
+    logarithm of ``factor`` has the standard ``deviation``; the ``proposed`` settings state this
+    factor.
     """
 
     name: str
@@ -125,7 +125,7 @@ class MotionFactor:
     proposed: str
 
     def __str__(self) -> str:
-        """Write what was found, and what is made of it."""
+        """Write the factor found, and the one in force."""
         found = f'{self.factor:.2f} × as stated (± {100.0 * self.deviation:.0f} %)'
         return f'{found}, taken as {self.applied:.2f} ×'
 

@@ -328,7 +328,7 @@ class Hypotheses:
     ) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.
 
-        Their costs include that of the hypothesis. A point that is taken for a new landmark has
+        Their costs include the hypothesis's own. A point that is taken for a new landmark has
         the same id in all of them. ``matched`` is the observation as a single hypothesis has
         matched it, None where there are several.
         """

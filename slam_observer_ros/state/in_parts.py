@@ -1,7 +1,7 @@
 """Observations that the usual step uses: nearly always whole, else in parts.
 
-What is rejected, or of new landmarks, is counted and entered over the same arrays afterwards, as
-:mod:`.step` does it.
+Points that are rejected are counted afterwards, over the same arrays, and those of new landmarks
+entered, as :mod:`.step` does it.
 """
 
 from __future__ import annotations
@@ -104,9 +104,9 @@ def _may_enter(state: State, new_ids: IntArray) -> bool:
 
 
 def _may_leave_out(state: State, rows: IntArray, rejected: BoolArray) -> bool:
-    """Return whether a few of the points (m,) are rejected, and their landmarks not yet in doubt.
+    """Return whether few of the points (m,) are rejected, and no landmark becomes doubtful by it.
 
-    They are ``rejected`` once more then.
+    The ``rejected`` ones are counted as such once more.
     """
     most = state.settings.max_rejections
     in_doubt = state.landmarks.in_doubt(rows[rejected], most, further=1)

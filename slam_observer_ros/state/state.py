@@ -1,4 +1,4 @@
-"""One hypothesis of pose and map: gains, what is known of errors, landmarks, and history."""
+"""One hypothesis of pose and map: gains, errors, landmarks and history."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class State:
         self.settings = settings  # those in force
         self.judges_innovations = False  # which takes time, and is for those who look at them
         self.is_mapping = True  # landmarks are added, and relocated if rejected too often
-        self.gains, self.errors = gains, gains.errors  # what moves X̂, what is known of its errors
+        self.gains, self.errors = gains, gains.errors  # they move X̂, and know its errors or not
         self.observer, self.axes = gains.observer, gains.axes
         self.calibration, self.motion_noise = gains.calibration, gains.motion_noise
         self.landmarks = LandmarkTable()
@@ -69,7 +69,7 @@ class State:
 
     @property
     def known_errors(self) -> Errors:
-        """What is known of the errors, where association asks, which needs that."""
+        """The errors, for association, which only gains that know them have."""
         if self.errors is None:
             raise TypeError('these gains know no joint covariance')
         return self.errors

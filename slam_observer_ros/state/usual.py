@@ -1,7 +1,7 @@
-"""Where the usual step reads the arrays of a state, and a state takes over what that did.
+"""The usual step over the arrays of a state, which takes over the results.
 
-Both return None, with no estimate changed, where anything is unusual: see :mod:`.observer.step`.
-Of large maps only those landmarks are read that are active, which those seen are by then.
+All returns None, with no estimate changed, where anything is unusual: see :mod:`.observer.step`.
+Of a large map only active landmarks are read; the landmarks seen have become active before.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _led_to(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return Â (s, 4, 4) and covariances (s, 6, 6) of ε to which :func:`advance` would lead.
 
-    Until each instant along what is known of velocities then.
+    Until each instant along the velocities known then.
     """
     joint, axes = state.joint, state.axes
     if joint is None or core.COMPILED is None:  # in numpy the general way costs less
@@ -124,13 +124,13 @@ def _in_world(
 
 
 class Corrected(NamedTuple):
-    """What the kernel made of points of known landmarks."""
+    """Points of known landmarks as the kernel was given them, and its results."""
 
     status: int  # DONE, or REJECTS: then nothing has changed
     rows: IntArray  # (m,) which landmarks
     seen: Seen
     out: Observed
-    factors: Factors | None  # what was learnt of the noise of the motion
+    factors: Factors | None  # as learnt of the noise of the motion
 
 
 def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Update:
@@ -144,9 +144,9 @@ def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Update
 
 
 def takes(state: State, event: ObservationEvent) -> bool:
-    """Return whether a state is a map of points at rest, and an observation of points alone.
+    """Return whether a state is a map of points at rest, and the observation has points alone.
 
-    Made at the state's instant, by a sensor that is known.
+    It must be of the state's instant, by a sensor that is known.
     """
     calibration, joint = state.calibration, state.joint
     return (
@@ -167,10 +167,10 @@ def correct(
     is_weighed: bool = False,
     of_all: Corrected | None = None,
 ) -> Corrected | None:
-    """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe of it.
+    """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe.
 
-    Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
-    ``is_weighed`` asks what was expected of the points, too.
+    The observation is one that the state :func:`takes`, or the part of one that ``of_all`` has not
+    rejected. If it ``is_weighed``, the results have what was expected of the points.
     """
     m, k, joint = len(rows), state.axes.point, state.joint
     if joint is None or not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
@@ -225,7 +225,7 @@ def correct(
 
 
 def _estimate(state: State, joint: JointCovariance) -> Estimate:
-    """Return what is estimated as plain arrays, of landmarks that :func:`_is_at_rest`."""
+    """Return the estimate as plain arrays, of a state that :func:`_is_at_rest`."""
     observer, matrix, active = state.observer, joint._matrix, joint.active
     return _estimate_of(
         state,
@@ -323,7 +323,7 @@ def _plain(array: FloatArray) -> FloatArray:
 
 
 def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Keyframe:
-    """Return what is needed to linearise again what was seen."""
+    """Return the points as they are kept to be linearised again."""
     seen, out, sensed = corrected.seen, corrected.out, None
     if seen.sensor is not None:
         number = state.calibration.sensors.index(event.sensor_frame)
