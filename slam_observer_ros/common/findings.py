@@ -347,7 +347,7 @@ KINDS = {
     'ignored_start': Kind(
         Level.WARNING,
         'no effect of initial_position and initial_yaw',
-        'set set_initial_pose: true',
+        'use set_initial_pose: true',
     ),
     # A loaded map
     'left_out_of_table': Kind(
