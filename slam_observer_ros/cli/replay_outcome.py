@@ -36,8 +36,7 @@ from slam_observer_ros.runs.health import (
     of_rejections,
 )
 from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
-from slam_observer_ros.runs.replay import Replay
-from slam_observer_ros.runs.reported_run import NisTally, ReportedRun, RunRecorder
+from slam_observer_ros.runs.reported_run import NisTally, Replay, ReportedRun, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)
@@ -224,8 +223,9 @@ def _of_run(outcome: ReplayOutcome) -> Iterator[Finding]:
     result = outcome.result
     estimator, counts = result.estimator, result.estimator.counts
     yield from of_rejections(counts)
-    yield from of_estimate(estimator)
+    # What ranges are taken for comes first: where that is wrong, noise makes up for it.
     yield from of_ranges(result.range_power, estimator.settings.range_is_depth)
+    yield from of_estimate(estimator)
     nis = None if outcome.recorder is None else outcome.recorder.mean_nis
     yield from of_fit(None if nis is None else math.sqrt(nis))
     if result.in_known_map and estimator.settings.localization_mode != 'off':
