@@ -80,6 +80,8 @@ class Hypotheses:
 
     def _start(self, state: State) -> None:
         self._all = [Hypothesis.of(state)]
+        # Else points have ids, and are what these say.
+        self._can_weigh = state.errors is not None
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
@@ -233,7 +235,7 @@ class Hypotheses:
     def _judge(self, event: ObservationEvent) -> None:
         """Stop where the wheels spin, and give up landmarks that the robot carries."""
         standing, best = self._standing, self.best
-        if best.errors is None or self._velocities is None:
+        if not self._can_weigh or self._velocities is None:
             return
         was_slipping, were_carried = standing.slip is not None, standing.carried
         lost = standing.note(best, event, self._velocities)
@@ -257,7 +259,7 @@ class Hypotheses:
             return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        if self.best.errors is None:
+        if not self._can_weigh:
             return self._observe_alone(event)
         matched = match(self.best, event) if len(self._all) == 1 else None
         if matched is not None and not unknown:

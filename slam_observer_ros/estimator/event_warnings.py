@@ -51,14 +51,14 @@ class EventWarnings:
         if count >= MANY_POINTS:
             self._warn_once('many_points', count=count)
 
-    def large_map(self, count: int, limit: int, is_dense: bool) -> None:
+    def large_map(self, count: int, limit: int, takes_all: bool) -> None:
         """Say once that a map is full, with 0 < ``limit``, and once that it takes long.
 
-        That is where a joint covariance has all landmarks in it.
+        That is where each observation ``takes_all`` of it.
         """
         if 0 < limit <= count:
             self._warn_once('full_map', count=count, limit=limit)
-        if is_dense and count >= MANY_LANDMARKS:
+        if takes_all and count >= MANY_LANDMARKS:
             self._warn_once('large_map', count=count)
 
     def loaded_map(self, count: int, limit: int) -> None:

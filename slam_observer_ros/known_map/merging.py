@@ -94,8 +94,7 @@ def joint_covariance(
     the gains know no joint covariance.
     """
     m, axes, points = len(rows), state.axes, state.observer.points[rows]
-    joint = state.joint
-    P = None if joint is None else joint.of_landmarks(rows, points, tags)
+    P = state.gains.landmark_covariance(rows, tags)
     if P is None or m == 0:
         return P
     # As the square of a root, so that rounding makes no variance negative, however small it is.

@@ -80,7 +80,7 @@ def _in_parts(
     if len(new.ids):
         enter(state, new, noise)
     past = state.relinearisation
-    if past is not None and past.is_active:
+    if past.is_active:
         past.add(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)), in_doubt=False)
     return _outcome(state, event.ids[known], rejected[known], of_all, of_used)
 

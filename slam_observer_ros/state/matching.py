@@ -38,9 +38,8 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
     m, rows = len(event.ids), state.landmarks.rows_of(event.ids)
     if not state.is_mapping:
         event, rows = mapped(state, event)
-    is_known, joint = rows >= 0, state.joint
-    if joint is not None:
-        joint.activate(rows[is_known])  # before anything is asked of them
+    is_known = rows >= 0
+    state.gains.activate(rows[is_known])  # before anything is asked of them
     covariances = point_covariances(state, event, rows)
     left_out = m - len(event.ids)
     if np.count_nonzero(is_known) == len(rows):  # as nearly always

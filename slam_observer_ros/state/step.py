@@ -56,8 +56,7 @@ def _correct(state: State, residuals: Residuals) -> FloatArray:
         return np.empty(0)
     before = state.observer.A.copy()
     weights = state.gains.observe(residuals)
-    if state.relinearisation is not None:
-        state.relinearisation.note_correction(before, state.observer.A)
+    state.relinearisation.note_correction(before, state.observer.A)
     return weights
 
 
@@ -82,7 +81,7 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     some_are = bool(np.count_nonzero(in_doubt))
     past = state.relinearisation
-    if past is not None and past.is_active:
+    if past.is_active:
         turns = seen_orientations(state, event, rows)
         past.add(keyframe_of(state, event, rows, turns), some_are)
     if some_are:

@@ -38,8 +38,7 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
         return matched
     before = state.observer.A.copy()
     weights, are_unclear = gains.correct_by_orientations(seen)
-    if state.relinearisation is not None:
-        state.relinearisation.note_correction(before, state.observer.A)
+    state.relinearisation.note_correction(before, state.observer.A)
     judged = ~are_unclear
     tags.count(seen.rows[judged], weights[judged] > 0.0)
     state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
@@ -66,7 +65,7 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
     if not len(seen.rows):
         return
     replaced = seen.rows[tags.are_known[seen.rows]]
-    if state.relinearisation is not None and len(replaced):
+    if len(replaced):
         state.relinearisation.forget_orientations(replaced)
     gains.add_orientations(seen)
 

@@ -28,7 +28,6 @@ from slam_observer_ros.observer.flat_arrays import (
     Observed,
     Seen,
 )
-from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
 from slam_observer_ros.observer.robust import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.motion_noise import Factors
@@ -60,25 +59,20 @@ def advance(
     state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
 ) -> FloatArray | None:
     """Move a state on between two stamps (27); return the variances (6,) of the motion by axis."""
-    x = _estimate(state)
-    if x is None:
+    if not state.gains.is_of_points:
         return None
+    x = _estimate(state)
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    calibration, joint = state.calibration, state.joint
-    if joint is not None:
-        joint.note_motion()
-    if state.relinearisation is not None and state.relinearisation.is_active:
-        history = state.relinearisation.history
-        history.begin(x.A)
-        drift = x.drift * to_s(end_ns - start_ns)
-        history.move_on(out.A, out.noise, out.sensitivity, drift, calibration)
+    state.known_errors.joint.note_motion()
+    duration_s = to_s(end_ns - start_ns)
+    state.relinearisation.move_on(x.A, out.A, out.noise, out.sensitivity, duration_s)
     of_driving = out.noise - out.of_turning
     is_rest = status == step.AT_REST
     state.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
     x.A[...] = out.A
-    if calibration.delay_error_ns:
+    if state.calibration.delay_error_ns:
         state._end_velocity = out.at_end
     return out.variances
 
@@ -110,11 +104,11 @@ def _led_to(
 
     Until each instant along what is known of velocities then.
     """
-    joint, axes = state.joint, state.axes
-    if joint is None or core.COMPILED is None:  # in numpy the general way costs less
+    errors, axes = state.errors, state.axes
+    if errors is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
     # Landmarks have no part in it.
-    now = joint.of_robot
+    now = errors.joint.of_robot
     P, p, figures = now.copy(), axes.p, state.motion_noise.figures
     x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, len(P), len(P))
     A, covariances = np.empty((len(ends_ns), 4, 4)), np.zeros((len(ends_ns), 6, 6))
@@ -148,7 +142,7 @@ class Corrected(NamedTuple):
 def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Outcome:
     """Keep a keyframe of an observation all of which has corrected a state; return its outcome."""
     past, out = state.relinearisation, corrected.out
-    if past is not None and past.is_active:
+    if past.is_active:
         past.add(keyframe(state, event, corrected), in_doubt=False)
     return Outcome(
         event.ids,
@@ -171,7 +165,7 @@ def takes(state: State, event: ObservationEvent) -> bool:
         and event.orientations is None
         and event.sensed is None  # late, and carried forward
         and not (calibration.corrects_points and event.sensor_frame not in calibration.sensors)
-        and _is_of_points(state)
+        and state.gains.is_of_points
     )
 
 
@@ -187,13 +181,11 @@ def correct(
     Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
     ``is_weighed`` asks what was expected of the points, too.
     """
-    m, k, joint = len(rows), state.axes.point, state.joint
-    if joint is None or not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
+    m, k, joint = len(rows), state.axes.point, state.known_errors.joint
+    if not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
         return None
     joint.activate(rows)
     x, places = _estimate(state), joint.places(rows)
-    if x is None:
-        return None
     seen = _seen(state, event, places)
     settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
     factors = noise.flat() if of_all is None else None
@@ -226,14 +218,11 @@ def correct(
         return None
     if status == step.DONE:
         noise.take(factors if of_all is None else of_all.factors)
-        if state.relinearisation is not None:
-            state.relinearisation.note_correction(x.A, out.A)
+        state.relinearisation.note_correction(x.A, out.A)
         x.A[...] = out.A
-        if not joint.is_dense:  # else these are views
-            state.observer.a[joint.active] = x.a
-            for column, changed in zip(columns, landmarks, strict=True):
-                column[rows] = changed[places]
-            joint.follow(out.moved)
+        for column, changed in zip((state.observer.a, *columns), (x.a, *landmarks), strict=True):
+            joint.put_back(column, changed)
+        joint.follow(out.moved)
         calibration, p = state.calibration, state.axes.p
         if calibration.count:
             calibration.shift(out.moved[p : p + calibration.count])
@@ -241,11 +230,9 @@ def correct(
     return Corrected(status, rows, seen, out, factors)
 
 
-def _estimate(state: State) -> Estimate | None:
-    """Return what is estimated as plain arrays; None unless that is a map of points at rest."""
-    joint, observer = state.joint, state.observer
-    if joint is None or not _is_of_points(state):
-        return None
+def _estimate(state: State) -> Estimate:
+    """Return what is estimated, of a map of points at rest, as plain arrays."""
+    joint, observer = state.known_errors.joint, state.observer
     matrix, active = joint._matrix, joint.active
     return _estimate_of(
         state,
@@ -254,17 +241,6 @@ def _estimate(state: State) -> Estimate | None:
         matrix._storage,
         matrix._size,
         joint.first,
-    )
-
-
-def _is_of_points(state: State) -> bool:
-    """Return whether what is estimated is a map of points at rest, and no more of them."""
-    joint = state.joint
-    return (
-        joint is not None
-        and not isinstance(joint, ExactMapCovariance)
-        and joint.chart.stride == state.axes.point
-        and not state.observer.have_moved
     )
 
 

@@ -92,6 +92,10 @@ class RiccatiGains(OrientationGains):
         self.joint.propagate(motion, points, observer.u[active])
         self.motion_noise.factors.move(motion.noise_by_kind)
 
+    def activate(self, rows: IntArray) -> None:
+        """See to it that landmarks (m,) are in P."""
+        self.joint.activate(rows)
+
     def residuals(
         self,
         rows: IntArray,
@@ -269,6 +273,11 @@ class RiccatiGains(OrientationGains):
         """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
         X = self.joint.chart.step(x).X
         return np.asarray(se3.rotate(X.A, self.observer.points[rows]) + X.a[rows])
+
+    @property
+    def is_of_points(self) -> bool:
+        """Whether P is of points at rest and no more."""
+        return self.joint.is_of_points and not self.observer.have_moved
 
     @property
     def calibration_variances(self) -> FloatArray:
