@@ -36,10 +36,10 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
+from slam_observer_ros.observer.landmark_table import MIN_LOOP
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import accepted
-from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.matching import sensitivity
 from slam_observer_ros.state.state import State
 

@@ -32,8 +32,8 @@ from slam_observer_ros.geometry.matrices import are_covariances, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
 from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.observer.landmark_table import LandmarkTable
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
-from slam_observer_ros.state.landmark_table import LandmarkTable
 
 ROTATION_TOLERANCE = 1e-3
 """How far RᵀR of a pose may be from identity: much further than single precision puts it."""

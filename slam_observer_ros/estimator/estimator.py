@@ -687,7 +687,7 @@ class Estimator:
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
-        warnings.large_map(len(state.landmarks), limit, state.gains.takes_all)
+        warnings.large_map(len(state.landmarks), limit, state.gains)
         distance_m = math.hypot(*state.observer.A[:3, 3].tolist())
         if not distance_m <= DIVERGED_M:  # nor is what is no number
             self._start_again(distance_m)

@@ -9,6 +9,7 @@ import logging
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import IntArray
+from slam_observer_ros.observer.gains import Gains
 
 logger = logging.getLogger(__name__)
 
@@ -51,14 +52,11 @@ class EventWarnings:
         if count >= MANY_POINTS:
             self._warn_once('many_points', count=count)
 
-    def large_map(self, count: int, limit: int, takes_all: bool) -> None:
-        """Say once that a map is full, with 0 < ``limit``, and once that it takes long.
-
-        That is where each observation ``takes_all`` of it.
-        """
+    def large_map(self, count: int, limit: int, gains: Gains) -> None:
+        """Say once that a map is full, with 0 < ``limit``, and that its ``gains`` take long."""
         if 0 < limit <= count:
             self._warn_once('full_map', count=count, limit=limit)
-        if takes_all and count >= MANY_LANDMARKS:
+        if count >= MANY_LANDMARKS and gains.takes_all:
             self._warn_once('large_map', count=count)
 
     def loaded_map(self, count: int, limit: int) -> None:

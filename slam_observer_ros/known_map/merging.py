@@ -188,17 +188,17 @@ def _renumber(state: State, known: LandmarkMap, rows: IntArray, known_ids: IntAr
 def _complete(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
     """Go on in a map, ``added`` the part of it that the state did not have."""
     mode = state.settings.localization_mode
+    if mode == 'fixed':
+        _fix(state, known, added)
     state.landmarks.add_known(added.ids, _counts(added, state))
     state.is_mapping = mode == 'off'
-    if mode == 'fixed':
-        _fix(state, known)
     state.forget_past('the pose in the loaded map was found')
 
 
-def _fix(state: State, known: LandmarkMap) -> None:
-    """Put the landmarks exactly where the map has them, and leave them there."""
-    order = np.argsort(known.ids)
-    rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
+def _fix(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
+    """Put the landmarks, and those added, where the map has them, and leave them there."""
+    order, ids = np.argsort(known.ids), np.append(state.landmarks.ids, added.ids)
+    rows = order[np.searchsorted(known.ids, ids, sorter=order)]
     exact = _in_reference_frame(state, known.select(rows))
     state.fix_landmarks(exact)
 

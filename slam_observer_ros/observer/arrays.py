@@ -7,6 +7,7 @@ from typing import ClassVar, Protocol, TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray, LandmarkColumns
+from slam_observer_ros.observer.landmark_table import LandmarkTable
 from slam_observer_ros.observer.orientations import LandmarkOrientations
 from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
@@ -26,8 +27,8 @@ class FilterArrays(LandmarkColumns):
 
     Only this folder writes to them; others read, and copy what they keep. Attributes are
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
-    each (n, 3), metres and m/s, the ``orientations`` of tags, and ``covariance``, P (N, N), empty
-    for gains that know none.
+    each (n, 3), metres and m/s, the ``orientations`` of tags, what was seen of each landmark
+    (``landmarks``), and ``covariance``, P (N, N), empty for gains that know none.
     ``calibration`` (43 + 7 s,) has the values of velocities and of s sensors
     (:mod:`.sensor_models.calibration`).
     ``have_moved`` says whether any landmark has had a velocity so far, ``is_exact`` that the map
@@ -45,7 +46,7 @@ class FilterArrays(LandmarkColumns):
         self.A: FloatArray = np.eye(4)
         self.covariance = SymmetricMatrix(np.zeros((0, 0)))
         self.calibration: FloatArray = np.empty(0)
-        self.orientations = LandmarkOrientations()
+        self.orientations, self.landmarks = LandmarkOrientations(), LandmarkTable()
         self.have_moved = self.is_exact = False
         self.postponed: Postponed | None = None
 
@@ -59,5 +60,17 @@ class FilterArrays(LandmarkColumns):
         other = super().copy()
         other.reference_pose, other.A = self.reference_pose.copy(), self.A.copy()
         other.covariance, other.calibration = self.covariance.copy(), self.calibration.copy()
-        other.orientations = self.orientations.copy()
+        other.orientations, other.landmarks = self.orientations.copy(), self.landmarks.copy()
         return other
+
+    def append_zeros(self, m: int) -> IntArray:
+        """Append landmarks; return which (m,)."""
+        self.orientations.append_zeros(m)
+        self.landmarks.append_zeros(m)
+        return super().append_zeros(m)
+
+    def delete(self, rows: IntArray) -> None:
+        """Delete landmarks; those behind move up."""
+        self.orientations.delete(rows)
+        self.landmarks.delete(rows)
+        super().delete(rows)

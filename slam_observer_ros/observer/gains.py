@@ -150,11 +150,6 @@ class Gains(ABC):
         """What moves it by orientations of tags; None where only their positions are used."""
         return None
 
-    @property
-    def is_of_points(self) -> bool:
-        """Whether P is known, of points at rest and no more: the usual step is of such maps."""
-        return False
-
     # The step (27)-(31)
 
     def advance(self, motion: Motion) -> None:

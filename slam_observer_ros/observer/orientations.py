@@ -76,6 +76,11 @@ class LandmarkOrientations(LandmarkColumns):
         """Let landmarks have no orientation."""
         self.B[rows] = 0.0
 
+    def reset(self) -> None:
+        """Let no landmark have an orientation, and none ever seen."""
+        for name in self.COLUMNS:
+            getattr(self, name)[...] = 0
+
     def turn(self, rows: IntArray | slice, turns: FloatArray) -> None:
         """Let those of landmarks (m,) become R_i B̂_i of ``turns`` R_i (m, 3, 3)."""
         self.B[rows] = turns @ self.B[rows]

@@ -21,7 +21,6 @@ from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
 from slam_observer_ros.state import covariances
-from slam_observer_ros.state.landmark_table import LandmarkTable
 
 
 class State:
@@ -34,7 +33,7 @@ class State:
         self.gains, self.errors = gains, gains.errors  # what moves X̂, what is known of its errors
         self.observer, self.axes = gains.observer, gains.axes
         self.calibration, self.motion_noise = gains.calibration, gains.motion_noise
-        self.landmarks = LandmarkTable()
+        self.landmarks = self.observer.landmarks
         # How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it.
         is_ignored = 'landmark_velocity_stddev' in gains.ignores
         self.landmark_velocity_stddev = 0.0 if is_ignored else settings.landmark_velocity_stddev
@@ -54,7 +53,7 @@ class State:
         other.gains = gains = self.gains.copy()
         other.observer, other.errors = gains.observer, gains.errors
         other.calibration, other.motion_noise = gains.calibration, gains.motion_noise
-        other.landmarks, other.counts = self.landmarks.copy(), self.counts.copy()
+        other.landmarks, other.counts = gains.observer.landmarks, self.counts.copy()
         other.relinearisation = self.relinearisation.copy(other)
         return other
 
@@ -197,13 +196,11 @@ class State:
         """Forget the landmarks at ``rows``; those behind move up."""
         self.relinearisation.remove(rows)
         self.gains.remove(rows)
-        self.landmarks.remove(rows)
 
     def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
         """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: :meth:`.Gains.merge`."""
         square = self.gains.merge(rows, copies, most)
         if square <= most:
-            self.landmarks.merge(rows, copies)
             self.relinearisation.merge(rows, copies)
             self.counts['merged_landmark'] += len(rows)
         return square

@@ -59,7 +59,7 @@ def advance(
     state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
 ) -> FloatArray | None:
     """Move a state on between two stamps (27); return the variances (6,) of the motion by axis."""
-    if not state.gains.is_of_points:
+    if not _is_of_points(state):
         return None
     x = _estimate(state)
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
@@ -165,7 +165,7 @@ def takes(state: State, event: ObservationEvent) -> bool:
         and event.orientations is None
         and event.sensed is None  # late, and carried forward
         and not (calibration.corrects_points and event.sensor_frame not in calibration.sensors)
-        and state.gains.is_of_points
+        and _is_of_points(state)
     )
 
 
@@ -228,6 +228,12 @@ def correct(
             calibration.shift(out.moved[p : p + calibration.count])
         state.rejected_in_a_row, state.was_contradicted = 0, False
     return Corrected(status, rows, seen, out, factors)
+
+
+def _is_of_points(state: State) -> bool:
+    """Return whether what is known is P of a map of points at rest, and no more of them."""
+    errors = state.errors
+    return errors is not None and errors.joint.is_of_points and not state.observer.have_moved
 
 
 def _estimate(state: State) -> Estimate:

@@ -264,6 +264,7 @@ class RiccatiGains(OrientationGains):
         if square <= most:
             joint.update(HP, S, r)
             self._move(-x)
+            self.observer.landmarks.merge(rows, copies)
             self.remove(copies)
             self.observer.set_reference(self.observer.points)
         self._compress_if_large(0)
@@ -273,11 +274,6 @@ class RiccatiGains(OrientationGains):
         """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
         X = self.joint.chart.step(x).X
         return np.asarray(se3.rotate(X.A, self.observer.points[rows]) + X.a[rows])
-
-    @property
-    def is_of_points(self) -> bool:
-        """Whether P is of points at rest and no more."""
-        return self.joint.is_of_points and not self.observer.have_moved
 
     @property
     def calibration_variances(self) -> FloatArray:
