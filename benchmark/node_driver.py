@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.cdr import CdrReader
-from slam_observer_ros.nodes.message_classes import MESSAGES
+from slam_observer_ros.nodes.ros_interface import MESSAGES
 
 RELIABLE = QoSProfile(depth=100)
 TICK_S = 1.0 / TICK_HZ

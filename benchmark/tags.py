@@ -25,7 +25,7 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.sensor_models.calibration import without_calibration
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.tag_orientations import flipped
+from slam_observer_ros.state.step import flipped
 
 MAX_SEEN = (1, 2, 5)
 SIGMAS_RAD = (0.02, 0.05, 0.15)

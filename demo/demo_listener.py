@@ -25,7 +25,7 @@ from slam_observer_ros.messages.poses import (
     decode_pose_stamped,
     decode_pose_with_covariance_stamped,
 )
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS, TFMessage
+from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, TFMessage
 from slam_observer_ros.recording.writer import RecordingWriter
 
 CAUGHT_UP_NS = 500_000_000  # lag of an estimate at the end: the last events are held back

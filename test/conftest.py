@@ -19,7 +19,6 @@ from hypothesis import settings
 import pytest
 
 from slam_observer_ros.common.process import use_one_thread
-from slam_observer_ros.estimator import estimator  # noqa: F401  # loads what computes in threads
 
 if TYPE_CHECKING:
     from node_processes import Client
@@ -51,7 +50,7 @@ os.environ['MPLBACKEND'] = 'Agg'
 # A background job of a shell ignores Ctrl-C, and so would all programs that the tests stop by it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# As the programs do: tests on a busy machine take ten times longer otherwise.
+# As the programs do, and before numpy is loaded: tests take ten times longer otherwise.
 use_one_thread()
 
 # The same examples everywhere, so that a failure can be repeated by whoever reads of it; and no

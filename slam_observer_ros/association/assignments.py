@@ -1,8 +1,8 @@
 """Which landmarks the points of an observation are, where the sensor gave no ids.
 
-An *assignment* takes each such point for a landmark, or for a new one. What matters is where it
-puts the robot: among assignments that agree on that, within the sensor's noise, the most likely
-one is taken. Assignments that disagree are all returned, for later observations to decide
+An *assignment* takes each such point for a known landmark, or for a new one, and so puts the robot
+at some pose. Of assignments that agree on the pose, within the sensor's noise, the most likely one
+is taken. Assignments that disagree are all returned, for later observations to decide
 (:mod:`slam_observer_ros.association.hypotheses`).
 
 A point with a new id may be of a landmark that had none so far, but only where the state predicts
@@ -25,8 +25,8 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import (
@@ -37,8 +37,7 @@ from slam_observer_ros.geometry.matrices import (
     with_blocks,
 )
 from slam_observer_ros.observer.landmark_table import MIN_LOOP
-from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Observer, Residuals
 from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.state.matching import sensitivity
 from slam_observer_ros.state.state import State
@@ -47,13 +46,13 @@ MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""
 
 HARDLY_MOVED = 0.5 * RESOLUTION
-"""How far an observation moves its points at most, in standard deviations of the sensor, where
-it does not matter which of them it takes for landmarks.
+"""Shift of the points, in standard deviations of the sensor, up to which a correction hardly moves
+the robot: then no other assignment has to be looked for.
 """
 
 UNCERTAIN = 3.0
-"""How many times less well than the sensor measures it is known where an old landmark should be
-seen that points are held back from.
+"""Deviation of an old landmark's prediction, over the sensor's, from which on it does not show
+which of several landmarks a point is of: such pairs are held back.
 """
 
 
@@ -62,7 +61,7 @@ class Assignment:
     """What the points of an observation are taken for."""
 
     rows: IntArray  # (m,) row of the landmark that each point is, −1 for a new one
-    cost: float  # −2 ln of its likelihood, up to what all assignments share
+    cost: float  # −2 ln of its likelihood; a part that all assignments share is left out
 
 
 def find_assignments(
@@ -91,7 +90,7 @@ def find_assignments(
         return [Assignment(_taken(m, at, rows), 0.0)]
     PC, CPC = state.known_errors.predicted(residuals)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
-    # What it costs that a point is of no landmark.
+    # The cost of a point that is of no landmark.
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
     none_costs = np.where(event.ids == UNKNOWN_ID, new_cost, gate_cost)
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
@@ -112,7 +111,7 @@ def find_assignments(
 
 
 class _PoseMoves:
-    """How far pairings move the robot, by how far it moves the points, in the sensor's σ."""
+    """How far pairings move the robot: by the shift of the points, in the sensor's σ."""
 
     def __init__(self, state: State, seen: _Points, PC: FloatArray) -> None:
         axes = state.axes
@@ -179,10 +178,10 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
 def _are_held_back(
     state: State, seen: _Points, residuals: Residuals, at: IntArray, distances: FloatArray
 ) -> BoolArray:
-    """Return which pairs (q,) of a point and an old landmark are not yet decided.
+    """Return which pairs (q,) of a point and an old landmark are not decided yet.
 
-    There are so many that the point may be of, and so many new ones about that by how these lie
-    it can be decided later which of the old ones they are.
+    The point may be of many old landmarks, and there are many new ones: how these lie will show
+    later which of the old ones they are.
     """
     landmarks, rows, stamp_ns = state.landmarks, residuals.rows, seen.stamp_ns
     held_back = np.zeros(len(at), dtype=np.bool_)

@@ -30,7 +30,7 @@ from slam_observer_ros.geometry.matrices import (
     with_blocks,
 )
 from slam_observer_ros.geometry.se3 import rigid_alignment
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, gated
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion
@@ -157,14 +157,14 @@ ITERATIONS = 10
 """Gauss-Newton steps to the likeliest pose; the last ones hardly move it."""
 
 MIN_VARIANCE = 1e-6
-"""Least variance of where a robot without odometry gets and sees what it does, rad² or m²."""
+"""Least variance of a motion without odometry, rad² or m²."""
 
 
 def slip(state: State, matched: MatchedObservation) -> float:
-    """Let the robot have slipped so that it sees what it does; return the cost of that motion.
+    """Let the robot have slipped to where it sees these landmarks; return the cost of the motion.
 
-    Its pose is then known as badly as if there had been no odometry for as long as that takes, and
-    the observation is yet to be used.
+    Its pose is then as uncertain as if there had been no odometry for as long as that takes. The
+    observation is yet to be used.
     """
     # The noise of a motion without odometry, for as long as it takes.
     observer, start = state.observer, state.observer.A.copy()
@@ -191,7 +191,7 @@ def slip(state: State, matched: MatchedObservation) -> float:
 
 
 def _duration_s(state: State, matched: MatchedObservation) -> float:
-    """Return after how long without odometry a robot might see what it does, seconds."""
+    """Return how long a robot without odometry would take to get there, seconds."""
     settings, k, residuals = state.settings, state.axes.point, matched.residuals
     points = matched.known.points
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
@@ -253,7 +253,7 @@ class RejectedLandmarks:
     def explain_by_slip(self, state: State, matched: MatchedObservation) -> bool:
         """Let the robot have slipped if that explains all rejections; return whether it does.
 
-        The observation has to be matched again then.
+        Then the observation has to be matched again.
         """
         known, settings = matched.known, state.settings
         if not len(known.ids):
@@ -272,7 +272,7 @@ class RejectedLandmarks:
         return False
 
     def _agree(self, state: State, matched: MatchedObservation, others: list[int]) -> bool:
-        """Return whether a pose that explains what is seen explains the ``others``, too."""
+        """Return whether a pose that explains this observation explains the ``others``, too."""
         trial = state.copy()
         slip(trial, matched)
         trial.gains.observe(match(trial, matched.event).residuals)

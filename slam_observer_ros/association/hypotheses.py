@@ -2,9 +2,9 @@
 
 Where two interpretations of an observation put the robot at different poses, both are followed,
 each with a state of its own, until later observations have made one much more likely than the
-other (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states with the same
-pose that take what is seen there for different landmarks, as their maps differ. Where landmarks
-have ids or are well separated there is nearly always one.
+other (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are two that take the
+points for different landmarks at the same pose: their maps differ. Where landmarks have ids or are
+well separated there is nearly always one hypothesis.
 """
 
 from __future__ import annotations
@@ -33,17 +33,12 @@ from slam_observer_ros.association.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
-from slam_observer_ros.events import (
-    FIRST_AUTOMATIC_ID,
-    is_automatic,
-    ObservationEvent,
-    UNKNOWN_ID,
-)
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
-from slam_observer_ros.sensor_models.evidence import DelayEvidence
+from slam_observer_ros.sensor_models.integration import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
@@ -59,7 +54,7 @@ and a third one is hardly ever the right one.
 
 @dataclass(frozen=True, slots=True)
 class _Child:
-    """A hypothesis after an observation, what it took that for, and the outcome."""
+    """A hypothesis after an observation, the meaning that it took it in, and the outcome."""
 
     hypothesis: Hypothesis
     event: ObservationEvent
@@ -159,7 +154,7 @@ class Hypotheses:
         """Return the covariance (…, 6, 6) of the first pose (…, 4, 4), by all hypotheses.
 
         It is Σ w_i (P_i + d_i d_iᵀ), with w_i their likelihoods, and d_i how far their poses are
-        from that of the first. Coordinates are those of :meth:`.State.pose_after`.
+        from the first one, in the coordinates of :meth:`.State.pose_after`.
         """
         pose, own = of_each[0]
         if len(of_each) == 1:  # as nearly always
@@ -174,7 +169,7 @@ class Hypotheses:
         return total
 
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
-        """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns`` (27)."""
+        """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
         for hypothesis in self._all:
             state = hypothesis.state
             before = state.observer.A.copy()
@@ -266,7 +261,7 @@ class Hypotheses:
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matched)
             if is_clear and not may_relabel(self.best, matched):
                 return step(self.best, matched)
-        # All hypotheses with all meanings; costs are over that of the most likely one.
+        # All hypotheses with all meanings; costs are differences to the most likely one.
         children = self._follow(event, self._interpret(event, matched))
         least_cost = children[0].hypothesis.cost
         self._all = [child.hypothesis for child in children]
@@ -331,8 +326,9 @@ class Hypotheses:
     ) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.
 
-        The cost is that of the hypothesis as well. A point has the same id in all of them that
-        take it for a new landmark. ``matched`` is what a single hypothesis has made of it.
+        Their costs include that of the hypothesis. A point that is taken for a new landmark has
+        the same id in all of them. ``matched`` is the observation as a single hypothesis has
+        matched it, None where there are several.
         """
         new_ids, margin = self._new_ids(len(event.ids)), pruning_cost(event.ids)
         gate_cost = unpaired_cost(self.best.settings.rejection_threshold)

@@ -1,7 +1,7 @@
-"""One of several hypotheses about pose and map: a state, and what points without an id need.
+"""One of several hypotheses about pose and map: a state, and helpers for points without an id.
 
-Those need to know which landmarks lie near them, without a search of the whole map for each, and
-what a sensor sees of landmarks: which should have been seen, and which were.
+For such points there is an index, which finds near landmarks without a search of the whole map,
+and a record of the sensor's view: which landmarks should have been seen, and which were.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import is_automatic, ObservationEvent
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.landmark_table import LandmarkTable
 from slam_observer_ros.state.state import State
@@ -129,7 +129,7 @@ MAX_EVIDENCE = 2.0
 
 
 class Visibility:
-    """What a sensor without ids sees of the landmarks around it, in ``k`` = 2 or 3 dimensions."""
+    """The view of a sensor without ids, in ``k`` = 2 or 3 dimensions: what it sees and misses."""
 
     def __init__(self, k: int) -> None:
         self._field_of_view = FieldOfView(k)
@@ -152,11 +152,11 @@ class Visibility:
         """Count which landmarks were in view of an observation, already used, and which were seen.
 
         Some of its points came without an id. Unless others have one (``some_have_ids``), which
-        show better where the robot is, the pose is counted as unexpected if for so long none of
-        the landmarks in view was seen that it is no chance any more. Landmarks that were seen too
-        seldom while in view are forgotten; those out of view never: one may be the only tie to
-        what was mapped before. Return −2 ln of the probability that confirmed landmarks in view
-        were missed.
+        show better where the robot is, the pose is counted as unexpected if none of the landmarks
+        in view was seen for so long that it is no chance any more. Landmarks that were seen too
+        seldom while in view are forgotten; landmarks out of view never: one may be the only tie
+        to an older part of the map. Return −2 ln of the probability that confirmed landmarks in
+        view were missed.
         """
         # What should have been seen, and was.
         landmarks = state.landmarks
@@ -201,7 +201,7 @@ class Visibility:
         return share * int(np.count_nonzero(in_view & ~seen))
 
     def _cost(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
-        """Return what it costs that confirmed landmarks (u,) in view were not seen once more.
+        """Return the cost of confirmed landmarks (u,) in view that were missed once more.
 
         The rate at which one in view is seen differs between landmarks and poses. Where it is
         exponentially distributed about its mean p, one is missed k times in a row with the
@@ -219,7 +219,7 @@ class Visibility:
         in_view: BoolArray,
         seen: BoolArray,
     ) -> bool:
-        """Count those (n,) in view and not seen; return whether they are too many, too long."""
+        """Count landmarks (n,) in view that were missed; return whether too many, too long."""
         numbers = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
         old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)
         if (old & seen).any():
@@ -240,7 +240,7 @@ Verdicts: TypeAlias = dict[int, tuple[FloatArray, bool]]
 
 @dataclass(slots=True, eq=False)
 class Hypothesis:
-    """A state, and what only points without an id need of it."""
+    """A state, with the helpers for points without an id."""
 
     state: State
     visibility: Visibility  # what is in view of a sensor that gives no ids

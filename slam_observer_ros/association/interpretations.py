@@ -27,10 +27,10 @@ from slam_observer_ros.association.costs import (
 )
 from slam_observer_ros.association.hypothesis import LandmarkIndex, Verdicts
 from slam_observer_ros.association.joint_compatibility import joint_cost
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, are_far, far_from_the_others
 from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
 from slam_observer_ros.state.state import State
@@ -48,8 +48,8 @@ class Interpretation:
     event: ObservationEvent  # all ids filled in, points taken for outliers left out
     cost: float  # −2 ln of its likelihood, without what all interpretations share
     slipped: State | None = None  # the state, if the robot moved in any way since the last one
-    # Points that the gate lets pass and that are left out all the same. Their landmarks were seen
-    # so seldom that the landmarks may be the outliers.
+    # Points that pass the gate and are left out all the same: their landmarks were seen so seldom
+    # that these may be the outliers.
     disbelieved: ObservationEvent | None = None
     suspects: IntArray = field(default_factory=_none)  # ids that may be wrong, left out or not
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
@@ -89,7 +89,7 @@ def interpretations(
     if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
         found = find_assignments(state, index, event, new_cost, budget, is_alone)
         return _of_suspects(_by_assignments(state, event, new_ids, suspects, found), suspects)
-    # All ids are right, or those of one or all suspects are wrong, or the robot slipped.
+    # All ids are right, or the ids of one or all suspects are wrong, or the robot slipped.
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
     else:
@@ -125,8 +125,8 @@ def _without(
     # It is no cheaper than trusting them …
     out = np.isin(state.landmarks.ids[residuals.rows], ids)
     cost = max(trusting.cost, pairing_cost(state, len(event.ids), residuals.select(~out)))
-    # … but for what is seen once more at one position, where the landmark was seen so seldom that
-    # it may itself be the outlier.
+    # … but for a point that is seen again at one position, of a landmark that was seen so seldom
+    # that it may itself be the outlier.
     unconfirmed = out & (state.landmarks.counts[residuals.rows] < state.settings.confirmations)
     again, staying = cost_of_staying(state, matched)
     saved = float(np.sum(outlier_cost(state) - staying[again & unconfirmed]))
@@ -160,8 +160,8 @@ def consistent(
 ) -> list[Interpretation]:
     """Return the interpretations that judge points as before, where they were before.
 
-    A point that was left out and one at the same place that is believed are halves of two
-    stories, each of which another hypothesis has followed from the start.
+    To leave out a point and then believe one at the same place mixes two stories; each of them
+    has been followed by another hypothesis from the start.
     """
     if not verdicts:
         return possible

@@ -75,8 +75,8 @@ class _Extensions:
     pairings: list[Pairing]  # b of them
     options: IntArray  # (o,) the pairs
     costs: FloatArray  # (b, o + 1) the cost then, last without any; infinite where it can't be
-    rows: FloatArray  # (b, o, k, q k + k) what is appended to L
-    tails: FloatArray  # (b, o, k) what is appended to z
+    rows: FloatArray  # (b, o, k, q k + k) rows to append to L
+    tails: FloatArray  # (b, o, k) entries to append to z
 
     def extended(self, i: int, j: int) -> Pairing:
         """Return pairing i with pair j, or without any."""

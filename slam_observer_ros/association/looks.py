@@ -20,7 +20,7 @@ SLIPS = (np.zeros(6), np.repeat([1.0, 0.0], 3))
 """Shares (6,) of a motion that are made where wheels spin: nothing, or the turn alone."""
 
 NOISE = 3.0
-"""Standard deviations of what a sensor says, within which a landmark is where it should be."""
+"""Standard deviations of the sensor within which a landmark is where it should be."""
 
 MOVED = 2.0
 """Standard deviations from which on a landmark has hardly stood still."""
@@ -37,7 +37,7 @@ MOST = 0.75
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """An observation, and how many of the moves that are remembered were before it."""
+    """An observation, and how many of the remembered moves were before it."""
 
     event: ObservationEvent
     moves: int
@@ -45,14 +45,14 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Landmarks (m,) that a sensor has seen twice, and points (m, 3) of theirs, body frame."""
+    """Landmarks (m,) that a sensor has seen twice, as points (m, 3) in the body frame."""
 
     event: ObservationEvent  # the later one …
     rows: list[int]  # … and which of its points these are
     ids: list[int]
-    before: FloatArray
-    points: FloatArray
-    expected: FloatArray  # where odometry has them
+    before: FloatArray  # where they were seen first
+    points: FloatArray  # where they are seen now
+    expected: FloatArray  # where they should be by odometry
     motion: FloatArray  # (4, 4) in between, by odometry
     since_ns: int
 
@@ -92,13 +92,13 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What landmarks (m,) have done in the robot's frame, in standard deviations."""
+    """How landmarks (m,) have moved in the robot's frame, in standard deviations."""
 
     ids: list[int]
-    shift: FloatArray  # from where each was
-    way: FloatArray  # by odometry, which may be off as well
-    error: FloatArray  # from where that has it
-    slipped: FloatArray  # (s, m) from where each of the SLIPS has it
+    shift: FloatArray  # how far each is from where it was
+    way: FloatArray  # how far it should be from there by odometry, which may be off as well
+    error: FloatArray  # how far it is from where it should be by odometry
+    slipped: FloatArray  # (s, m) how far it is from where it should be by each of the SLIPS
     off: FloatArray  # (m, k) the error in metres, body frame
     noise: FloatArray  # (m, k, k) of the sensor in both observations, m²
     C: FloatArray  # (m, k, p) how the motion's error moves each
@@ -106,7 +106,7 @@ class View:
 
     @classmethod
     def of(cls, state: State, seen: list[Pairs], velocities: VelocityHistory) -> View:
-        """Return what pairs of points of one sensor or several show."""
+        """Return the view of pairs of points of one sensor or several."""
         k, A = state.axes.point, state.observer.A
         noise = sensor_noise(state, seen)
         now = np.concatenate([pairs.points for pairs in seen])
@@ -127,7 +127,7 @@ class View:
 
     @property
     def passes(self) -> BoolArray:
-        """Which (m,) are clearly elsewhere, and nearer to where odometry has them."""
+        """Which landmarks (m,) have clearly moved, and are where odometry has them."""
         return (self.shift > CLEAR) & (2.0 * self.error < self.shift)
 
     @property
@@ -137,9 +137,9 @@ class View:
         return bool(2 * np.count_nonzero(neither) > len(neither))
 
     def shows(self, slipped: FloatArray, places: BoolArray) -> bool:
-        """Return whether places say so of a slip that has landmarks ``slipped`` (m,) off.
+        """Return whether places clearly show a slip, which leaves landmarks ``slipped`` (m,) off.
 
-        And clearly so, beside what odometry may be off by.
+        That odometry is off by its noise must not explain them as well.
         """
         gain, agree = self.error**2 - slipped**2, places & (slipped <= NOISE)
         differ = places & (slipped > NOISE) & (gain < -(NOISE**2))
@@ -155,7 +155,7 @@ class View:
 
 
 def ids_of(looks: list[Look]) -> set[int]:
-    """Return the ids of what was seen."""
+    """Return the ids of the points seen."""
     return {i for look in looks for i in look.event.ids.tolist() if i != UNKNOWN_ID}
 
 
@@ -174,13 +174,13 @@ def product(moved: list[FloatArray]) -> FloatArray:
 def _motion_noise(state: State, pairs: Pairs, velocities: VelocityHistory) -> FloatArray:
     """Return the covariance (p, p) of the motion between them, with that of its bias."""
     calibration, end_ns = state.calibration, pairs.event.stamp_ns
-    # What led there so long ago that it is forgotten was off by as much.
+    # The velocities before are forgotten: they were off by as much.
     since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)
     start = state.observer.A.dot(se3.inverse(pairs.motion))
     motion = integrate(velocities, calibration, state.motion_noise, start, since_ns, end_ns, None)
     longer = (end_ns - pairs.since_ns) / max(end_ns - since_ns, 1)
     F = longer * motion.sensitivity
-    # As it is stated: what slips and carried landmarks have added to it is no reason to wait.
+    # As it is stated: slips and carried landmarks themselves have made the factor larger.
     noise = longer / max(1.0, state.motion_noise.factors.applied.max()) * motion.noise
     total: FloatArray = noise + (F * state.gains.calibration_variances) @ F.T
     return total

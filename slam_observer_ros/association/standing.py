@@ -1,9 +1,9 @@
-"""What stands still in the robot's frame while odometry says that the robot drives on.
+"""Landmarks that stand still in the robot's frame although the robot drives on by odometry.
 
-If all does, the robot stands and its wheels spin, for as long as that lasts: each observation is
-off by too little to be rejected, and pose and landmarks would be dragged along. So would they if
-it turns and slides. If some of it stands while other landmarks pass as odometry has it, the robot
-carries them along: these are not places.
+If all landmarks do, the robot stands and its wheels spin: each observation is off by too little to
+be rejected, and pose and landmarks would be dragged along. So would they if it turns and slides.
+If some landmarks do, while others pass as odometry has it, the robot carries them along: they are
+not places.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.state import State
 
 TEST_NS, LONGEST_WAIT_NS = to_ns(0.25), to_ns(1.0)
-"""How often what is in view is compared with what was: at the most, and at least."""
+"""Least and longest time between two comparisons of an observation with the start."""
 
 LAST_TEST_NS = to_ns(15.0)
-"""For how long it is compared with the same look, where it passes slowly."""
+"""For how long observations are compared with the same start, where landmarks pass slowly."""
 
 USUAL = 4.0
-"""Standard deviations, in the mean, with which it is quickly seen what passes."""
+"""Standard deviations, in the mean, of ways by which it is quickly clear that landmarks pass."""
 
 FORGOTTEN = 0.95
-"""What is left of the way that this took after each time, as the noise may be less now."""
+"""Factor of the way that this takes, after each comparison: the noise may be less now."""
 
 CERTAIN = 2.0 * CLEAR**2
-"""Evidence with which a landmark is carried, at most: two looks or more, −2 ln of a likelihood."""
+"""Most evidence that a landmark is carried, −2 ln of a likelihood; it takes two looks or more."""
 
 TOGETHER_NS = to_ns(0.25)
 """Observations of few landmarks each, or of several sensors, are one look for so long.
@@ -65,10 +65,10 @@ MAX_MOTIONS = 500
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """What odometry says of a motion that was not made."""
+    """A motion that odometry reports and the robot has not made."""
 
     back: FloatArray  # (4, 4) motion from where odometry has the robot
-    stray: FloatArray  # (6,) twist of what may not have been made in all
+    stray: FloatArray  # (6,) twist of all that it may not have made
 
 
 @dataclass(slots=True)
@@ -91,22 +91,22 @@ class Standing:
     carried: set[int] = field(default_factory=set)
     excluded: set[int] = field(default_factory=set)  # landmarks that are carried, or may be
     slip: int | None = None  # which of the SLIPS goes on
-    # (4, 4) each by odometry, without corrections, since a start …
+    # (4, 4) moves by odometry, without corrections, since the start …
     moved: list[FloatArray] = field(default_factory=list)
     sensor_frame: str = ''  # an observation is due from another one, …
     due_ns: int = 0  # … or from here on
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
-    _starts: list[Look] = field(default_factory=list)  # what is compared with, …
-    _latest: list[Look] = field(default_factory=list)  # … and what is
-    _tested: list[Look] = field(default_factory=list)  # the latest when that was judged
+    _starts: list[Look] = field(default_factory=list)  # looks to compare with, …
+    _latest: list[Look] = field(default_factory=list)  # … and those to be compared
+    _tested: list[Look] = field(default_factory=list)  # the latest ones of the last comparison
     _test_ns: int = 0
-    _wait_ns: int = TEST_NS  # until so much has passed that it is clear
-    _odd: set[int] = field(default_factory=set)  # what did not pass as it should have
-    _usual_m2: float = 0.0  # mean square of the ways from which on it is clear what passes, …
-    _enough_m2: float = 0.0  # … or with which it is judged again
-    # During a slip, when each landmark was seen last, and whether as that has it.
+    _wait_ns: int = TEST_NS  # until landmarks have passed so far that it is clear
+    _odd: set[int] = field(default_factory=set)  # landmarks that did not pass as they should have
+    _usual_m2: float = 0.0  # mean square of the ways from which on it is clear, …
+    _enough_m2: float = 0.0  # … or from which on it is judged again
+    # During a slip, when each landmark was seen last, and whether where the slip has it.
     _agreed: dict[int, tuple[int, bool]] = field(default_factory=dict)
-    _earlier: list[FloatArray] = field(default_factory=list)  # … and that before
+    _earlier: list[FloatArray] = field(default_factory=list)  # … and since the one before
 
     def clear_time(self) -> None:
         """Compare nothing with what was seen before."""
@@ -119,7 +119,8 @@ class Standing:
     ) -> Lost | None:
         """Judge an observation that is due and yet to be used, by the most likely state.
 
-        Return what was not made of the motion since the last observation if the wheels slip.
+        If the wheels slip, return the part of the motion since the last observation that was not
+        made.
         """
         if event.velocities is not None:
             return None  # landmarks may move as the robot does
@@ -136,7 +137,7 @@ class Standing:
             self._latest.append(look)
             if event.stamp_ns >= self._test_ns:
                 lost = self._test(state, look, velocities)
-        # Each where there are several sensors, or few landmarks in one.
+        # Each observation is due where there are several sensors, or few landmarks in one.
         is_whole = len(self._starts) == 1 and len(self._starts[0].event.ids) >= LEAST
         self.due_ns = self._test_ns if is_whole and self.slip is None else 0
         return lost
@@ -196,13 +197,13 @@ class Standing:
         return None
 
     def _wait(self, stamp_ns: int, age_ns: int, way_m2: float) -> None:
-        """Wait with the next test until so much should have passed that it is clear."""
+        """Wait with the next test until landmarks should have passed so far that it is clear."""
         needed = math.sqrt(self._usual_m2 / way_m2) if way_m2 else math.inf
         self._wait_ns = int(min(max(needed * age_ns, TEST_NS), LONGEST_WAIT_NS))
         self._test_ns = stamp_ns + max(self._wait_ns - age_ns, TEST_NS)
 
     def _begin_slip(self, ids: list[int], stamp_ns: int) -> Lost:
-        """Compare with what is seen now, by the slip; return what was lost since the last look."""
+        """Compare with the present looks, by the slip; return what the last motion lost."""
         self._agreed = dict.fromkeys(ids, (stamp_ns, True))
         self._starts = self._latest
         lost = self._lost(self.moved[-1:], self._earlier + self.moved)
@@ -210,13 +211,13 @@ class Standing:
         return lost
 
     def _is_usual(self, ids: list[int], lagging: set[int]) -> bool:
-        """Return whether all passes but for what is carried, and now and then for one more."""
+        """Return whether all landmarks pass but the carried ones, and one more now and then."""
         odd = lagging ^ self.carried.intersection(ids)
         before, self._odd = self._odd, odd
         return 2 * len(odd) < len(ids) and odd.isdisjoint(before)
 
     def _pairs(self) -> list[Pairs]:
-        """Return what was seen at the start and lately, each landmark once by each sensor."""
+        """Return pairs of points seen at the start and lately, each landmark once a sensor."""
         seen, known = [], dict[str, set[int]]()
         for now in reversed(self._latest):
             but = known.setdefault(now.event.sensor_frame, {UNKNOWN_ID})
@@ -237,7 +238,7 @@ class Standing:
         return False
 
     def _go_on(self, state: State, look: Look) -> Lost | None:
-        """Return what :meth:`note` does during a slip, or None once it is over."""
+        """Return what :meth:`note` returns during a slip; None once it is over."""
         event, made = look.event, self.moved
         self._slip_on(made)
         self._latest, look = [Look(event, 0)], Look(event, 0)
@@ -264,7 +265,7 @@ class Standing:
         return self._lost(made, made)
 
     def _slip_on(self, made: list[FloatArray]) -> None:
-        """Move what is compared with by what a slip makes of motions; forget these."""
+        """Move the looks to compare with as a slip makes of motions; forget the motions."""
         back = se3.exp(-SLIPS[self.slip or 0] * se3.log(product(made)))
         self._starts = [
             Look(replace(one.event, points=se3.transform(back, one.event.points)), 0)
@@ -273,13 +274,13 @@ class Standing:
         self.moved = []
 
     def _lost(self, made: list[FloatArray], whole: list[FloatArray]) -> Lost:
-        """Return what was lost of motions, and may be of others."""
+        """Return the part of motions that was lost, and of the ``whole`` that may be."""
         share, motion = SLIPS[self.slip or 0], product(made)
         back = se3.inverse(motion).dot(se3.exp(share * se3.log(motion)))
         return Lost(back, (1.0 - share) * se3.log(product(whole)))
 
     def _are_places(self, state: State, ids: list[int]) -> BoolArray:
-        """Return which landmarks (m,) are at rest, as far as is known."""
+        """Return which landmarks (m,) are at rest for all we know."""
         places = np.array([i not in self.excluded for i in ids], dtype=np.bool_)
         if not state.is_mapping:
             places &= state.landmarks.rows_of(np.array(ids)) >= 0

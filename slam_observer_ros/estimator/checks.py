@@ -11,16 +11,20 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import (
+    BoolArray,
+    FIRST_AUTOMATIC_ID,
+    FloatArray,
+    IntArray,
+    is_automatic,
+    LAST_AUTOMATIC_ID,
+)
 from slam_observer_ros.estimator.event_warnings import EventWarnings, listed
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
-    FIRST_AUTOMATIC_ID,
     flatten,
     IMPOSSIBLE_ID,
-    is_automatic,
-    LAST_AUTOMATIC_ID,
     MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,

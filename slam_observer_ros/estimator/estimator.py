@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 import logging
 import math
@@ -10,12 +9,10 @@ import time
 
 import numpy as np
 
-from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
-from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.checks import (
     check_event,
     check_velocities,
@@ -23,8 +20,10 @@ from slam_observer_ros.estimator.checks import (
     usable_maps,
     usable_points,
 )
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.estimator.event_queue import EventQueue
-from slam_observer_ros.estimator.event_warnings import EventWarnings, UNEXPECTED_POSES
+from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
+from slam_observer_ros.estimator.placement import Placement
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
 from slam_observer_ros.events import (
     Event,
@@ -36,14 +35,10 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.known_map.loop_closure import LoopClosure
-from slam_observer_ros.known_map.merging import map_of
 from slam_observer_ros.observer.continuous_time import lyapunov
-from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
-from slam_observer_ros.settings.parameter_table import changed_names, checked, table
-from slam_observer_ros.state.state import State
+from slam_observer_ros.settings.parameter_table import checked, table
 from slam_observer_ros.state.usual import Outcome
 
 logger = logging.getLogger(__name__)
@@ -51,11 +46,8 @@ logger = logging.getLogger(__name__)
 DIVERGED_M = 1e9
 """Distance from the start, metres, that no estimate has."""
 
-GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
-"""Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
 
-
-class Estimator:
+class Estimator(Estimate):
     """Pose and landmark map from time-stamped velocities and observations.
 
     The state advances only at event stamps, in stamp order, so its bits don't depend on when
@@ -84,23 +76,15 @@ class Estimator:
         on_jump: Callable[[], None] | None = None,
         judges_innovations: bool = False,
     ) -> None:
-        self.settings = settings = checked(settings)  # those in force
+        settings = checked(settings)
         self._live = LiveSettings.of(settings)
-        self._counts: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()  # events refused, by reason
-        self.jumps = 0  # how often the clock has jumped
-        self._warnings = EventWarnings()
-        self.last_update: Update | None = None  # None before the first observation
+        self._placement = Placement(self._live, judges_innovations)
+        super().__init__(settings, self._placement.hypotheses, self._placement.localiser)
         self._on_update, self._on_stamps = on_update, on_stamps
         self._on_motion, self._on_jump = on_motion, on_jump
-        self._judges_innovations = judges_innovations
-        self._start_pose: FloatArray | None = None
-        self._was_placed = False  # by somebody, so the pose of the settings is not its start
-        self._hypotheses = Hypotheses(self._state_at(np.eye(4)))
-        self._localiser = Localiser()
         self._loop_closure = LoopClosure()
         self.reset(initial_pose)
-        self._warn_of_unused()
+        self._warnings.unused_settings(settings, self._state.gains)
 
     def reset(self, pose: FloatArray | None = None) -> None:
         """Forget the motion, what was mapped and events held back, and start again.
@@ -108,12 +92,8 @@ class Estimator:
         At ``pose`` (4, 4), body to world; by default at that of the settings, or else at identity,
         or unknown in a loaded map. Raise :exc:`ParameterError` if it is no rigid motion.
         """
-        self._start_pose = pose = None if pose is None else rigid(pose)
-        self._was_placed = pose is not None
-        if pose is None and self.settings.set_initial_pose:
-            self._start_where_settings_say()
-        else:
-            self._start(pose)
+        self._start_pose = None if pose is None else rigid(pose)
+        self._placement.reset(self._start_pose)
         self._clear_time()
         self.last_update = None
 
@@ -139,7 +119,7 @@ class Estimator:
             self._timeline.catch_up()
             self._report_stamp()
             self._hypotheses.clear_time()
-            self._was_placed = True
+            self._placement.was_placed = True
             self._clear_time()
         self.jumps += 1
         if self._on_jump is not None:
@@ -170,18 +150,8 @@ class Estimator:
         if pose is not None:
             pose = rigid(pose, pose_covariance)
             self._timeline.catch_up()
-        self._localiser.load(maps, self.settings.two_d_mode)
-        # The pose in it: the given one, the one of the settings, or the one that landmarks show.
-        is_at_start = self.stamp_ns is None and not self._was_placed
-        if pose is not None:
-            self._move_robot(pose, pose_covariance)
-        elif self.settings.set_initial_pose and is_at_start:
-            self._start_where_settings_say()
-        elif self._state.is_mapping:
-            if self._localiser.enter(self._state):
-                self._hypotheses.prune_to_best()
-        else:  # in a map that does not grow there is nothing to carry into another one
-            self._start(None)
+        is_at_start = self.stamp_ns is None
+        self._placement.load(maps, pose, pose_covariance, is_at_start=is_at_start)
 
     def set_pose(
         self,
@@ -201,11 +171,7 @@ class Estimator:
         if stamp_ns is not None and self.knows_motion_since(stamp_ns):
             known = np.zeros((6, 6)) if covariance is None else covariance
             pose, covariance = self._timeline.moved_on(pose, known, stamp_ns)
-        self._move_robot(pose, covariance)
-
-    def knows_motion_since(self, stamp_ns: int) -> bool:
-        """Return whether velocities are known from a stamp on, nanoseconds: of seconds at most."""
-        return self._timeline.knows_motion_since(stamp_ns)
+        self._placement.place(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.
@@ -286,219 +252,14 @@ class Estimator:
         self._timeline.catch_up()
         self._report_stamp()
 
-    def smooth(self) -> Smoothed:
-        """Return the smoothed trajectory and map since the history began; the state is kept.
-
-        The history is that of the whole run with ``smoothing_window`` 0. Raise ParameterError if
-        none is kept, and SmoothingError if the observations don't determine everything.
-        """
-        return self._state.smooth()
-
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""
         return self._hypotheses.forget(landmark_id)
 
     @property
-    def counts(self) -> Counter[str]:
-        """How many events were used, by kind, and the outcome for the landmarks in them.
-
-        Events used (``'velocity'``, ``'observation'``), late ones among them
-        (``'late_velocity'``, ``'late_observation'``), points (``'observed_point'``), observations
-        made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
-        (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
-        had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
-        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'carried_landmark'``,
-        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``,
-        ``'merged_landmark'``, ``'doubled_landmark'``) and points not used (``'unknown_id'``,
-        ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
-        """
-        return self._counts + self._localiser.counts + self._hypotheses.counts
-
-    @property
-    def is_localised(self) -> bool:
-        """Whether the estimate is in its final frame, that of a map if one was loaded."""
-        return self._localiser.is_localised
-
-    @property
-    def localisation_problem(self) -> Finding | None:
-        """Why the pose in a loaded map is not known; None if it is."""
-        return self._localiser.problem(self._state.observer.A)
-
-    @property
-    def possible_poses(self) -> FloatArray:
-        """(q, 4, 4) where in a loaded map the robot may be, by points without ids, likely first.
-
-        As of the last search; empty where none fits, and where the pose is known.
-        """
-        places = [] if self.is_localised else self._localiser.places
-        poses = [place.transform @ self._state.observer.A for place in places]
-        return np.array(poses).reshape(-1, 4, 4)
-
-    @property
-    def map_name(self) -> str:
-        """Name of the loaded map in whose frame the estimate is; empty if it is in none."""
-        loaded = self._localiser.loaded
-        return loaded.name if loaded is not None and self.is_localised else ''
-
-    @property
-    def landmark_map(self) -> LandmarkMap:
-        """The present map, as it can be saved and loaded: without landmarks that move.
-
-        Unless its frame is that of a loaded map, its covariances are those of its shape alone.
-        """
-        state, loaded = self._state, self._localiser.loaded if self.is_localised else None
-        landmark_map = map_of(state, loaded)
-        is_joint = landmark_map.joint_covariance is not None or state.observer.is_exact
-        if landmark_map.covariances is not None and not is_joint:
-            self._warnings.warn('left_out_correlations', count=len(landmark_map.ids))
-        return landmark_map
-
-    @property
-    def stamp_ns(self) -> int | None:
-        """Stamp of the last event that was used, nanoseconds; None before the first."""
-        return self._timeline.stamp_ns
-
-    @property
     def newest_stamp_ns(self) -> int | None:
         """Newest stamp received, nanoseconds; it may still be held back."""
         return self._queue.newest_ns
-
-    @property
-    def pose(self) -> FloatArray:
-        """(4, 4) estimated pose at ``stamp_ns``, body to world."""
-        leads_on = self._timeline.lead_s > 0.0
-        return self.uncertain_pose[0] if leads_on else self._state.observer.pose
-
-    def pose_at(self, stamp_ns: int) -> FloatArray:
-        """Return the pose (4, 4) at any time: the state, moved on by the velocities since."""
-        observer, state_ns = self._state.observer, self._timeline.state_ns
-        if state_ns is None or stamp_ns == state_ns:
-            return observer.pose
-        return observer.pose @ self._timeline.motion(state_ns, stamp_ns)
-
-    def poses_at(
-        self, stamps_ns: IntArray, with_covariances: bool = True
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the poses (s, 4, 4) and their covariances (s, 6, 6) as they were known then.
-
-        Of stamps (s,) that ``on_stamps`` has just been called with. None if no covariance is
-        known, or asked for: they take longer.
-        """
-        timeline = self._timeline
-        if stamps_ns[0] < (timeline.stamp_ns or 0):
-            return self._hypotheses.poses_until(
-                timeline.velocities, timeline.state_ns or 0, stamps_ns, with_covariances
-            )
-        # The present stamp alone, maybe of an observation.
-        if not with_covariances:
-            return self.pose[None], None
-        pose, covariance = self._hypotheses.pose_after(
-            timeline.velocities, timeline.state_ns or 0, timeline.stamp_ns or 0
-        )
-        return pose[None], None if covariance is None else covariance[None]
-
-    @property
-    def pose_covariance(self) -> FloatArray | None:
-        """(6, 6) covariance of the pose at ``stamp_ns``: rotation vector, position; rad², m².
-
-        Along the world's axes; it includes that the most likely hypothesis may be wrong. None
-        where the filter knows no covariance.
-        """
-        return self.uncertain_pose[1]
-
-    @property
-    def uncertain_pose(self) -> tuple[FloatArray, FloatArray | None]:
-        """:attr:`pose` and :attr:`pose_covariance`, both for what one of them costs."""
-        timeline = self._timeline
-        start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        pose, covariance = self._hypotheses.pose_after(timeline.velocities, start_ns, end_ns)
-        return pose if end_ns > start_ns else self._state.observer.pose, covariance
-
-    @property
-    def body_velocity(self) -> FloatArray:
-        """(6,) newest velocity (Ω, v), calibrated, rad/s and m/s; zero when it has timed out."""
-        velocity = self._timeline.body_velocity  # of a little earlier or later if delayed
-        return np.zeros(6) if velocity is None else self._state.calibration.apply(velocity)
-
-    @property
-    def body_velocity_covariance(self) -> FloatArray | None:
-        """(6, 6) covariance of :attr:`body_velocity`, as stated with it or as the settings say.
-
-        That of no velocity is what the robot may do then. None before there are two messages.
-        """
-        held = self._timeline.velocity_in_force
-        if held is None:
-            return None
-        state, axes = self._state, self._state.axes
-        measured = state.motion_noise.velocity_covariance(held)
-        if axes.p < len(measured):
-            measured = axes.full_pose_covariance(measured[axes.pose, axes.pose])
-        return state.calibration.apply_to_covariance(
-            measured, held.body_velocities[0], state.gains.calibration_variances
-        )
-
-    @property
-    def velocity_is_stale(self) -> bool:
-        """Whether no velocity was in force at ``stamp_ns``, so that the pose is being held."""
-        return self._timeline.body_velocity is None
-
-    @property
-    def landmark_ids(self) -> IntArray:
-        """(n,) ids of the landmarks in the map: those seen ``confirmations`` times or more."""
-        return self._state.landmarks.ids[self._state.confirmed]
-
-    @property
-    def landmark_counts(self) -> IntArray:
-        """(n,) number of observations of each landmark."""
-        return self._state.landmarks.counts[self._state.confirmed]
-
-    @property
-    def world_points(self) -> FloatArray:
-        """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
-        state, lead_s = self._state, self._timeline.lead_s
-        points = state.observer.world_points[state.confirmed]
-        return points + lead_s * self.landmark_velocities if lead_s else points
-
-    @property
-    def landmark_covariances(self) -> FloatArray | None:
-        """(n, 3, 3) covariances of the landmarks at ``stamp_ns``, world, m²; None if unknown."""
-        of_all = self._state.landmark_covariances(self._timeline.lead_s)
-        return None if of_all is None else of_all[self._state.confirmed]
-
-    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
-        """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
-
-        In the body frame, of k coordinates (2 in ``two_d_mode``, else 3), as of the last
-        observation: ask for it in ``on_update``. ``rows`` (m,) are indices into ``landmark_ids``.
-        None where the filter knows none, or landmarks are fixed, whose errors nobody knows.
-        """
-        return self._state.configuration_covariance(self._state.confirmed[rows])
-
-    @property
-    def landmark_velocities(self) -> FloatArray:
-        """(n, 3) velocities of landmarks that move, known or estimated, m/s, world."""
-        observer = self._state.observer
-        return se3.rotate(observer.reference_pose, observer.u[self._state.confirmed])
-
-    @property
-    def calibration(self) -> list[CalibrationEstimate]:
-        """Scale, bias and delay of the velocity, as far as the settings ask for them."""
-        return self._hypotheses.calibration
-
-    @property
-    def motion_factors(self) -> list[MotionFactor]:
-        """How noisy turning and driving are over what is stated; empty where that is not known."""
-        return self._state.motion_noise.factors.estimates
-
-    @property
-    def lyapunov(self) -> float:
-        """L (34) of the latest observation's residuals; zero before the first."""
-        return 0.0 if self.last_update is None else self.last_update.lyapunov
-
-    @property
-    def _state(self) -> State:
-        """The most likely state."""
-        return self._hypotheses.best
 
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
@@ -551,57 +312,21 @@ class Estimator:
             event, self.settings, state.gains, state.landmarks, self._counts, warnings
         )
         event = self._timeline.synchronise(usable)
-        if self._localiser.loaded is not None:
-            self._doubt_rough_pose(event)
+        if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
+            self._placement.doubt(*self.uncertain_pose)
         outcome = self._hypotheses.observe(event)
-        self._localise(event, outcome)
+        if self._localiser.maps:
+            self._placement.localise(event, outcome)
         if np.count_nonzero(event.ids == UNKNOWN_ID):
-            self._close_loops(event.stamp_ns)
+            is_alone = len(self._hypotheses) == 1
+            if self._loop_closure.follow(self._state, event.stamp_ns, is_alone=is_alone):
+                self._hypotheses.prune_to_best()
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
         self._warn_of(event, outcome)
         self.last_update = self._update(event.stamp_ns, outcome)
         if self._on_update is not None:
             self._on_update(self.last_update)
-
-    def _close_loops(self, stamp_ns: int) -> None:
-        """Merge landmarks without ids that turn out to be one."""
-        state, closure = self._state, self._loop_closure
-        closure.note(state, stamp_ns)
-        if not closure.is_due(state, stamp_ns):
-            return
-        merged = state.counts['merged_landmark']
-        if closure.close(state, stamp_ns):
-            self._hypotheses.prune_to_best()
-            merged = state.counts['merged_landmark'] - merged
-            logger.info('A loop has closed: %d landmarks without ids were seen before.', merged)
-        if len(self._hypotheses) == 1:
-            closure.merge_twins(state)
-            closure.count_doubled(state)
-
-    def _doubt_rough_pose(self, event: ObservationEvent) -> None:
-        """Search about a given pose that is too rough for the points of an observation."""
-        if not self._localiser.may_be_rough(event):
-            return
-        pose, covariance = self.pose, self.pose_covariance
-        if covariance is not None and is_rough(covariance):
-            self._start(None)
-            self._localiser.search_near(pose, covariance)
-
-    def _localise(self, event: ObservationEvent, outcome: Outcome) -> None:
-        """Look for the pose in a loaded map if it is not known, or not any more."""
-        if not self._localiser.maps:
-            return
-        missed = self._hypotheses.missed
-        reason = self._localiser.reason_to_reset(self._state, event, outcome, missed)
-        if reason is not None:
-            logger.warning('%s; localising again.', reason)
-            self._start(None)
-        if self._localiser.search(self._state):
-            self._hypotheses.prune_to_best()
-        elif (found := self._localiser.pose_by_tag(self._state)) is not None:
-            self._start(found.pose, found.covariance, found.known)
-            self._localiser.try_tag(found.tag_id)
 
     def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""
@@ -611,70 +336,7 @@ class Estimator:
             distance_m,
         )
         self._counts['diverged'] += 1
-        self._start(None)
-
-    def _move_robot(self, pose: FloatArray, covariance: FloatArray | None) -> None:
-        """Move the robot; if the pose in a loaded map was not known, it is now."""
-        self._was_placed = True
-        if self.is_localised:
-            self._hypotheses.prune_to_best().set_pose(self._allowed(pose), covariance)
-            self._localiser.doubt_pose()
-        else:
-            self._start(pose, covariance)
-
-    def _start_where_settings_say(self) -> None:
-        settings = self.settings
-        turn = settings.initial_roll, settings.initial_pitch, settings.initial_yaw
-        deviations = settings.initial_angle_stddev, settings.initial_position_stddev
-        pose = se3.from_rpy((*settings.initial_position, *turn))
-        self._start(pose, np.diag(np.repeat(deviations, 3) ** 2))
-
-    def _start(
-        self,
-        pose: FloatArray | None,
-        covariance: FloatArray | None = None,
-        known: LandmarkMap | None = None,
-    ) -> None:
-        """Start again with an empty map, or the loaded one, at ``pose`` (4, 4) if it is known.
-
-        ``known`` is the map that it is in; of several ones it is searched for if that is None.
-        """
-        rough = pose if known is None and len(self._localiser.maps) > 1 else None
-        pose = pose if rough is None else None
-        state = self._state_at(np.eye(4) if pose is None else self._allowed(pose))
-        self._hypotheses.reset(state)
-        self._localiser.start(state, pose is not None, covariance, known)
-        if rough is not None:
-            given = np.zeros((6, 6)) if covariance is None else covariance
-            self._localiser.search_near(rough, given + np.diag(GIVEN_POSE_STD**2))
-
-    def _state_at(self, pose: FloatArray) -> State:
-        """Return a state at its start, with P° = ``pose`` (4, 4)."""
-        state = State(make_gains(self._live, pose), self._live)
-        state.judges_innovations = self._judges_innovations
-        return state
-
-    def _allowed(self, pose: FloatArray) -> FloatArray:
-        """Return a pose (4, 4), or with ``two_d_mode`` what of it lies in the plane."""
-        return se3.flatten(pose) if self.settings.two_d_mode else pose
-
-    def _warn_of_unused(self) -> None:
-        """Name settings that have been changed and have no effect."""
-        settings = self.settings
-        changed = set(changed_names(settings))
-        if unused := [name for name in self._state.gains.ignores if name in changed]:
-            logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
-        is_ignored = 'use_tag_orientation' in self._state.gains.ignores
-        if settings.use_tag_orientation and self._state.gains.tags is None and not is_ignored:
-            logger.warning(
-                'use_tag_orientation has no effect with landmark_velocity_stddev: landmarks are '
-                'points that move (set landmark_velocity_stddev: 0.0 for tags at rest).'
-            )
-        is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
-        if is_given and not settings.set_initial_pose:
-            logger.warning(
-                'initial_position and initial_yaw have no effect (use set_initial_pose: true).'
-            )
+        self._placement.start(None)
 
     def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
         """Warn of what is wrong with an observation, its outcome, or the map."""

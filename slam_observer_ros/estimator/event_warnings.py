@@ -10,6 +10,8 @@ from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_table import changed_names
 
 logger = logging.getLogger(__name__)
 
@@ -87,6 +89,23 @@ class EventWarnings:
             if count > self._reported.get(name, 0):
                 self.warn(name)
                 self._reported[name] = count
+
+    def unused_settings(self, settings: Settings, gains: Gains) -> None:
+        """Name settings that have been changed and have no effect."""
+        changed = set(changed_names(settings))
+        if unused := [name for name in gains.ignores if name in changed]:
+            logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
+        is_ignored = 'use_tag_orientation' in gains.ignores
+        if settings.use_tag_orientation and gains.tags is None and not is_ignored:
+            logger.warning(
+                'use_tag_orientation has no effect with landmark_velocity_stddev: landmarks are '
+                'points that move (set landmark_velocity_stddev: 0.0 for tags at rest).'
+            )
+        is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
+        if is_given and not settings.set_initial_pose:
+            logger.warning(
+                'initial_position and initial_yaw have no effect (use set_initial_pose: true).'
+            )
 
     def _warn_once(self, kind: str, **figures: object) -> None:
         self._counts[kind] += 1

@@ -8,17 +8,19 @@ these lie to each other as old ones do, in one way only, they are those.
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
 from scipy.linalg import cholesky
 
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.known_map.merging import without_frame
 from slam_observer_ros.observer.landmark_table import MIN_LOOP
 from slam_observer_ros.state.state import State
+
+logger = logging.getLogger(__name__)
 
 PERIOD_NS = 5_000_000_000
 """Time between two searches, nanoseconds."""
@@ -57,6 +59,25 @@ class LoopClosure:
         self._apart: set[tuple[int, int]] = set()  # ids that were seen at once, side by side
         self._near_m = math.inf  # how far side by side is
         self._doubled: set[tuple[int, int]] = set()  # ids that were counted as such
+
+    def follow(self, state: State, stamp_ns: int, *, is_alone: bool) -> bool:
+        """Merge landmarks that turn out to be one, after an observation of points without ids.
+
+        Return whether a loop has closed. Else nothing is merged that other hypotheses may take
+        for several: unless the state ``is_alone``.
+        """
+        self.note(state, stamp_ns)
+        if not self.is_due(state, stamp_ns):
+            return False
+        merged = state.counts['merged_landmark']
+        has_closed = self.close(state, stamp_ns)
+        if has_closed:
+            merged = state.counts['merged_landmark'] - merged
+            logger.info('A loop has closed: %d landmarks without ids were seen before.', merged)
+        if is_alone or has_closed:
+            self.merge_twins(state)
+            self.count_doubled(state)
+        return has_closed
 
     def note(self, state: State, stamp_ns: int) -> None:
         """Note which landmarks an observation, already used, has shown to be two."""

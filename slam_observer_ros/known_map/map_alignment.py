@@ -12,8 +12,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.gauge import anchor, JITTER_M2
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.known_landmarks import anchor, JITTER_M2, KnownLandmarks
 from slam_observer_ros.state.state import State
 
 MAX_TURN_STD_RAD = 0.2
@@ -96,7 +95,7 @@ def _aligned(source: FloatArray, own: FloatArray, target: KnownLandmarks) -> Flo
 def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:
     """Return the standard deviation of the robot's attitude in a map, about the worst axis.
 
-    Parameters are those of :func:`slam_observer_ros.observer.gauge.anchor`.
+    Parameters are those of :func:`slam_observer_ros.observer.known_landmarks.anchor`.
     """
     turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
     try:

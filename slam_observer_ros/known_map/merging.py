@@ -15,8 +15,7 @@ import numpy as np
 from scipy.linalg import orth, solve_triangular
 
 from slam_observer_ros.common.errors import MapError
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
@@ -26,8 +25,7 @@ from slam_observer_ros.geometry.matrices import (
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import find_transform
 from slam_observer_ros.known_map.map_correlations import MAX_CORRELATED
-from slam_observer_ros.observer.gauge import JITTER_M2
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.known_landmarks import JITTER_M2, KnownLandmarks
 from slam_observer_ros.state.state import State
 
 ROUNDING = 1e-14
@@ -90,8 +88,8 @@ def joint_covariance(
     Of their positions, m², and of the rotation vectors of ``tags`` (t,) among them. A frame of
     one's own starts where the robot did, and all landmarks share the error of how they lie to that
     pose. Who loads the map knows it by its landmarks alone: what remains is the error of its
-    shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None where
-    the gains know no joint covariance.
+    shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.known_landmarks`.
+    None where the gains know no joint covariance.
     """
     m, axes, points = len(rows), state.axes, state.observer.points[rows]
     P = state.gains.landmark_covariance(rows, tags)

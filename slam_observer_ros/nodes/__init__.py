@@ -4,6 +4,6 @@
 give it to ``runner``. ``observer_nodes`` has the observer, plain and managed: shells around
 ``observer_core``, where what comes in (``intake/``) goes through the estimator to what goes out
 (``publishing/``); ``control_services``, ``map_services`` and ``initial_pose`` steer it.
-``simulator`` is the paper's simulation. Used by all: ``guarded_node`` (what callbacks raise and
-nodes log, and what a managed node destroys again), ``ros_parameters`` and ``message_classes``.
+``simulator`` is the paper's simulation. Used by all: ``ros_interface``, and ``guarded_node`` (what
+callbacks raise and nodes log, and what a managed node destroys again).
 """

@@ -14,8 +14,8 @@ from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
-from slam_observer_ros.nodes.message_classes import RELIABLE_QOS
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
+from slam_observer_ros.nodes.ros_interface import RELIABLE_QOS
 
 MAX_STEP_NS = 500_000_000
 """Time between two velocities, nanoseconds, whose stamps are believed at once."""

@@ -16,7 +16,7 @@ from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.map_services import MapServices, NamedMapServices
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
-from slam_observer_ros.nodes.ros_parameters import read_settings
+from slam_observer_ros.nodes.ros_interface import read_settings
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names

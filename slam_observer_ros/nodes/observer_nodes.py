@@ -11,10 +11,10 @@ from rclpy.node import Node
 
 from slam_observer_ros.common.errors import ParameterError, SlamObserverError
 from slam_observer_ros.nodes.guarded_node import Entities, forward_logging
-from slam_observer_ros.nodes.message_classes import install_command
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.ros_parameters import (
+from slam_observer_ros.nodes.ros_interface import (
     declare_settings,
+    install_command,
     read_settings,
     RepeatableParameters,
 )

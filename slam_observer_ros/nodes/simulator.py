@@ -15,10 +15,11 @@ from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
 from slam_observer_ros.nodes.publishing.pose_broadcaster import TransformPublisher
-from slam_observer_ros.nodes.ros_parameters import (
+from slam_observer_ros.nodes.ros_interface import (
     declare_settings,
+    LATCHED_QOS,
+    MESSAGES,
     read_settings,
     RepeatableParameters,
 )

@@ -50,7 +50,7 @@ class Chart:
 
     ``turn`` = q of these are of ω_i, 0 of ``axes`` without turns, ``velocity`` = k of ũ_i where
     velocities are estimated; else 0. Before ``first`` there may be ``postponed`` ones, of what no
-    motion and no view acts on: see :mod:`.compressed_covariance`.
+    motion and no view acts on: see :class:`.CompressedCovariance`.
     """
 
     def __init__(

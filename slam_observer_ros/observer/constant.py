@@ -22,7 +22,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
 from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.observer.gains import Gains, OF_JOINT_COVARIANCES
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.sensor_models.calibration import VELOCITY_STDDEVS
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])

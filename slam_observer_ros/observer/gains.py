@@ -1,4 +1,4 @@
-"""How X̂ on SLAM_n(3) is advanced, corrected and extended, and what is known of its errors.
+"""How X̂ on SLAM_n(3) is advanced, corrected and extended, and the covariance of its errors.
 
 Gains that know no joint covariance have no errors, and what a subclass of :class:`Gains` does not
 override is right where no noise is known. Landmarks are given by rows (m,), points (m, 3) in the
@@ -18,11 +18,10 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
+from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Observer, Residuals
 from slam_observer_ros.sensor_models.calibration import (
     Calibration,
     SENSOR_STDDEVS,
@@ -47,9 +46,9 @@ OF_JOINT_COVARIANCES = (
 
 
 class Errors:
-    """What is known of the errors of an ``observer``'s X̂: what ``joint``, P, says of them.
+    """Errors of an ``observer``'s X̂, as the covariance P, ``joint``, has them.
 
-    Covariances are those of errors in the reference frame, m² and rad².
+    They are in the reference frame; covariances are in m² and rad².
     """
 
     def __init__(self, observer: Observer, joint: JointCovariance, axes: EstimatedAxes) -> None:
@@ -78,7 +77,7 @@ class Errors:
         return self.joint.with_pose(rows, self.observer.points[rows])
 
     def orientation_matrices(self, rows: IntArray) -> FloatArray:
-        """Return B̂_i (m, 3, 3) of landmarks, zero for those that have none."""
+        """Return orientations B̂_i (m, 3, 3) of landmarks, zero where there is none."""
         return self.joint.turned(rows, self.observer.orientations.B[rows])
 
     def orientation_sigmas(self, rows: IntArray) -> FloatArray:
@@ -134,7 +133,7 @@ class Gains(ABC):
 
     @staticmethod
     def estimated(settings: Settings) -> Settings:
-        """Return the settings with as much of a calibration as is estimated."""
+        """Return the settings without what these gains do not estimate of a calibration."""
         return without_calibration(settings)
 
     def copy(self) -> Self:
@@ -250,11 +249,11 @@ class Gains(ABC):
         self.observer.set_reference(self.observer.points)
         self.add_known(others)
 
-    # What is known of the errors by any gains
+    # The errors, by any gains
 
     @property
     def calibration_variances(self) -> FloatArray:
-        """(c,) variances of what is estimated of the calibration."""
+        """(c,) variances of the calibration's estimates."""
         return np.empty(0)
 
     @property

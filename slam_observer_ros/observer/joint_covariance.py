@@ -21,11 +21,10 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
-from slam_observer_ros.observer.arrays import FilterArrays
+from slam_observer_ros.observer.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.observer.chart import Chart, sheared
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.sensor_models.motion import Motion
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ class JointCovariance:
     """P, kept in ``matrix``, and which of its columns are whose."""
 
     # Whether all landmarks are in P, and the rows of those that are, in its order: a correction
-    # moves these. See :mod:`.compressed_covariance`.
+    # moves these. See :class:`.CompressedCovariance`.
     is_dense = True
     active: IntArray | slice = slice(None)
 
@@ -135,7 +134,7 @@ class JointCovariance:
         return sheared(P, p, L)[p:, p:]
 
     def activate(self, rows: IntArray) -> None:
-        """See to it that landmarks (m,), which are going to be observed, are in P."""
+        """Bring landmarks (m,) that are going to be observed into P."""
 
     def places(self, rows: IntArray) -> IntArray:
         """Return which of the landmarks in P these are (m,)."""
@@ -149,7 +148,7 @@ class JointCovariance:
         return self
 
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags are with all that is postponed."""
+        """Return orientations ``B`` (m, 3, 3) of tags after all that is postponed."""
         return B
 
     # The step
@@ -159,7 +158,7 @@ class JointCovariance:
         # Here this is a view.
 
     def note_motion(self) -> None:
-        """Let it be known that the robot has moved."""
+        """Note that the robot has moved."""
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
         """Let the robot move, and landmarks of velocities ``u`` (n, 3), to ``points`` (n, 3)."""
@@ -221,7 +220,7 @@ class JointCovariance:
         return PC[:, : self._p], C @ PC - to_state @ transpose(C) + own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all together, (p, m k) and (m k, m k)."""
+        """Return :meth:`output` of all together, (p, m k) and (m k, m k)."""
         q, columns = C.shape[2], self._columns(rows)
         C, seen = C.reshape(-1, q), self._matrix.rows(columns)
         to_state = seen[:, :q]
@@ -339,7 +338,7 @@ class JointCovariance:
         self.P = self.chart.from_positions(covariance, points)
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃ and of all ã_i."""
         P = self.of_positions(points)
         P[: self._p] = P[:, : self._p] = 0.0
         P[: self._p, : self._p] = covariance

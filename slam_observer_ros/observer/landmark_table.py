@@ -7,8 +7,13 @@ from typing import ClassVar
 import numpy as np
 
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, LandmarkColumns
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    is_automatic,
+    LandmarkColumns,
+)
 
 PATIENCE = 4
 """How many times as often others must have been seen before a landmark has had its chance.

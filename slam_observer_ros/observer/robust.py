@@ -22,7 +22,7 @@ from slam_observer_ros.geometry.matrices import (
 from slam_observer_ros.settings.estimator_settings import Settings
 
 AT_ONCE = 32
-"""Points that are used at once; each block of so many is judged by what those before it left."""
+"""Points that are used at once. Of more, each block of so many is judged after the one before."""
 
 REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
@@ -38,8 +38,8 @@ def observation_weights(
 ) -> FloatArray:
     """Return the weight (m,) of each observation, zero where the gate rejects it.
 
-    Else Huber's of what the correction leaves of the residual, R S⁻¹ r, judged by the noise R as
-    in an M-estimator: where the state is uncertain, a large residual says nothing against it.
+    Other weights are Huber's. They judge R S⁻¹ r, the residual that the correction leaves, by the
+    noise R as in an M-estimator: where the state is uncertain a large residual r is no outlier.
     """
     gate = settings.rejection_threshold
     S_inv_r = _solve_residuals(r, predicted, noise)
@@ -81,7 +81,7 @@ def far_from_the_others(
     information: FloatArray = np.linalg.inv(S).astype(np.float64)
     S_inv_r = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
     blocks = diagonal_blocks(information, r.shape[1])
-    # What the others leave of the residual r_i: ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i.
+    # The rest of the residual r_i, after all others: ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i.
     left = np.asarray(np.linalg.solve(blocks, S_inv_r)[:, :, 0])
     passed[passed] = are_far(mahalanobis(left, noise[passed]), gate)
     return passed
@@ -104,9 +104,9 @@ def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatA
 def huber_weights(
     S_inv_r: FloatArray, noise: FloatArray, weights: FloatArray, threshold: float
 ) -> FloatArray:
-    """Return Huber's weights (m,) of what a correction leaves of residuals; 1 for ``threshold`` 0.
+    """Return Huber's weights (m,) of the residuals after a correction; 1 for ``threshold`` 0.
 
-    ``S_inv_r`` (m, k) is S⁻¹ r, in S the R = Σ/w of the old ``weights`` w and ``noise`` Σ.
+    ``S_inv_r`` (m, k) is S⁻¹ r, where S has R = Σ/w by the old ``weights`` w and ``noise`` Σ.
     """
     if threshold == 0.0:
         return np.ones(len(S_inv_r))

@@ -23,6 +23,10 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, with_blocks
 from slam_observer_ros.geometry.sensor_mounting import sensitivity as sensor_sensitivity
+from slam_observer_ros.observer.arrays import (
+    add_symmetric_product,
+    subtract_square,
+)
 from slam_observer_ros.observer.chart import slam_exp
 from slam_observer_ros.observer.flat_arrays import (
     Advanced,
@@ -39,10 +43,6 @@ from slam_observer_ros.observer.robust import (
     far_from_the_others,
     huber_weights,
     REWEIGHTINGS,
-)
-from slam_observer_ros.observer.symmetric_matrix import (
-    add_symmetric_product,
-    subtract_square,
 )
 from slam_observer_ros.sensor_models.calibration import calibrated, with_moves
 from slam_observer_ros.sensor_models.motion_noise import (

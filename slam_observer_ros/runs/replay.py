@@ -24,7 +24,7 @@ from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEve
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, Truth
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
-from slam_observer_ros.sensor_models.evidence import RangeErrors
+from slam_observer_ros.sensor_models.sensing import RangeErrors
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 

@@ -1,13 +1,29 @@
-"""The motion between two stamps: velocities as the calibration has them, with their noise."""
+"""The motion between two stamps: velocities as the calibration has them, with their noise.
+
+And how much of an estimated delay is noise of the velocities, which passes for change.
+The delay τ follows from how velocities change from observation to observation, f = Σ W_i V_i with
+the weights W_i of their means around the two, in the noise of the motion between them. Noise n_i
+of V_i is in f, too: it adds to what seems to be known of τ; and it is in the motion, so that the
+estimate follows it. Per second of motion, with densities q stated and q_n ≤ q in the velocities,
+
+    information  Σ f²/q,   of which is noise  Σ (q_n/q) Σ W_i²/T,   pull  Σ (q_n/q) Σ W_i t_i/T
+
+for velocities that came every T, each in force for t_i of the motion. Where a share ρ of the
+information is noise, the estimate goes only the part 1 − ρ of the way that the filter takes it to
+go: of an error at the start the share (σ²/σ_0²)^(1 − ρ) is left when σ_0 has become σ. All of it
+is known from the velocities and the stated noise alone.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
@@ -130,3 +146,92 @@ def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int
     """
     reach_ns, centre_ns = calibration.delay_error_ns, stamp_ns - calibration.delay_ns
     return velocities.mean(centre_ns - reach_ns, centre_ns + reach_ns)
+
+
+_PER_MEDIAN = 1.4826
+"""Standard deviation over the median of the absolute value, of normal distributions."""
+
+
+SAMPLED = 3
+"""One of so many motions is looked at: only ratios of sums count, and time."""
+
+
+class DelayEvidence:
+    """Sums over motions between observations."""
+
+    def __init__(self) -> None:
+        self._information = self._noise = self._pull = 0.0
+        # (6,) mean of how velocities usually differ from the one before, of how many motions.
+        self._steps, self._used, self._seen = np.zeros(6), 0, 0
+
+    def add(
+        self,
+        velocities: VelocityHistory,
+        calibration: Calibration,
+        variances: FloatArray,
+        start_ns: int,
+        end_ns: int,
+    ) -> None:
+        """Take in a motion between two stamps, of a state that estimates the delay.
+
+        It was off by ``variances`` (6,) by axis, rad² and m².
+        """
+        self._seen += 1
+        if self._seen % SAMPLED:
+            return
+        delay_ns, reach_ns = calibration.delay_ns, calibration.delay_error_ns
+        duration_s = to_s(end_ns - start_ns)
+        centres_ns = start_ns - delay_ns, end_ns - delay_ns
+        stamps, V = velocities.between(centres_ns[0] - reach_ns, end_ns)
+        if len(stamps) < 3 or stamps[0] == stamps[-1] or duration_s <= 0.0:
+            return
+        axes = calibration.axes.pose
+        V = V[:, axes]
+        W = _weights(stamps, centres_ns[1], reach_ns, end_ns)
+        W -= _weights(stamps, centres_ns[0], reach_ns, start_ns)
+        in_force_s = _overlaps(stamps, *centres_ns) / NANOSECONDS_PER_SECOND
+        period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) / NANOSECONDS_PER_SECOND
+        # How much noise there is: as stated, or less where velocities differ less.
+        steps = np.sort(np.abs(V[1:] - V[:-1]), axis=0)[(len(V) - 1) // 2]
+        self._used += 1
+        self._steps[axes] += (steps - self._steps[axes]) / self._used
+        found = 0.5 * (_PER_MEDIAN * self._steps[axes]) ** 2 * period_s
+        stated = variances[axes] / duration_s
+        is_noisy = stated > 0.0
+        stated = stated[is_noisy]
+        share = float(np.minimum(found[is_noisy] / stated, 1.0).sum()) / period_s
+        self._information += float((W.dot(V)[is_noisy] ** 2 / stated).sum()) / duration_s
+        self._noise += share * float(W.dot(W)) / duration_s
+        self._pull += share * float(W.dot(in_force_s)) / duration_s
+
+    def corrected(self, delay: CalibrationEstimate, initial_s: float) -> CalibrationEstimate:
+        """Return the estimate, ± ``initial_s`` at the start, without what the noise adds to it."""
+        if not (self._information > 0.0 and delay.deviation > 0.0):
+            return delay
+        prior, posterior = initial_s**-2, delay.deviation**-2
+        learnt = max(posterior - prior, 0.0)
+        true_share = max(1.0 - self._noise / self._information, 0.0)
+        pull = self._pull / self._information * learnt / posterior
+        left = initial_s * min(prior / posterior, 1.0) ** true_share
+        variance = 1.0 / (prior + learnt * true_share) + (0.5 * pull) ** 2 + left**2
+        deviation = min(math.sqrt(variance), initial_s)
+        return replace(delay, value=delay.value - pull, deviation=deviation)
+
+
+def _weights(stamps: IntArray, centre_ns: int, reach_ns: int, known_ns: int) -> FloatArray:
+    """Return the weights (m,) of velocities in :meth:`.VelocityHistory.mean`, asked at a stamp."""
+    known = int(stamps.searchsorted(known_ns, 'right'))
+    weights = np.zeros(len(stamps))
+    weights[:known] = _overlaps(stamps[:known], centre_ns - reach_ns, centre_ns + reach_ns)
+    total = weights.sum()
+    return weights / total if total else weights
+
+
+def _overlaps(stamps: IntArray, start_ns: int, end_ns: int) -> IntArray:
+    """Return for how long (m,) each velocity was in force between two stamps, nanoseconds."""
+    # A fifth of what np.append, np.clip and np.diff cost, of so few.
+    bounds = np.empty(len(stamps) + 1, dtype=np.int64)
+    bounds[:-1], bounds[-1] = stamps, end_ns
+    bounds = np.minimum(np.maximum(bounds, start_ns), end_ns)
+    overlaps: IntArray = bounds[1:] - bounds[:-1]
+    return overlaps

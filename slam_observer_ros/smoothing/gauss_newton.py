@@ -24,7 +24,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, PLANAR
 from slam_observer_ros.geometry.matrices import transpose
-from slam_observer_ros.observer.orientations import UNKNOWN_RAD
+from slam_observer_ros.observer.arrays import UNKNOWN_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import (
     COMPILED,

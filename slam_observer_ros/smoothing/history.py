@@ -14,7 +14,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
-from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors

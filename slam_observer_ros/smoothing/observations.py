@@ -16,7 +16,7 @@ from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.geometry.sensor_mounting import Sensed, sensitivity, shown_at, turning
-from slam_observer_ros.observer.orientations import flip_verdicts
+from slam_observer_ros.observer.arrays import flip_verdicts
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 

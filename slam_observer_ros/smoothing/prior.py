@@ -12,7 +12,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import definite_inverse, solve_definite, transpose
-from slam_observer_ros.observer.orientations import UNKNOWN_RAD
+from slam_observer_ros.observer.arrays import UNKNOWN_RAD
 
 ANYWHERE_M = 1e3
 """Standard deviation of an unknown landmark, metres."""

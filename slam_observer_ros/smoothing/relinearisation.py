@@ -9,7 +9,7 @@ which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After
 there may be no such summary until landmarks seen before are seen again. Else the cost does not
 grow with the history; only :meth:`Relinearisation.smooth` needs all of it.
 
-It is O(n³) for n landmarks. In a map without a dense covariance (:mod:`.compressed_covariance`)
+It is O(n³) for n landmarks. In a map without a dense covariance (:class:`.CompressedCovariance`)
 nothing is relinearised any more. Its history goes on, to be smoothed, until it would have to begin
 again: then it is given up. Among tags the covariance stays dense, but from
 :data:`MAX_UNKNOWNS` on nothing is relinearised, either.

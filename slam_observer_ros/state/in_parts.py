@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, IntArray
+from slam_observer_ros.common.types import BoolArray, IntArray, is_automatic
 from slam_observer_ros.estimates import NormalisedInnovation
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.observer.step import DONE, REJECTS
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import (

@@ -1,4 +1,7 @@
-"""Matching an observation with a state: which landmarks it is of, residuals, their noise."""
+"""Matching an observation with a state: which landmarks it is of, residuals, their noise.
+
+And what a filter expects residuals to be, and how far off they are by that.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis
+from slam_observer_ros.observer.arrays import SeenOrientations
+from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.observer.observer import Residuals
+from slam_observer_ros.observer.step import LOG_ROOT_2_PI
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
@@ -184,3 +191,47 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     if np.count_nonzero(is_sure) < len(rows):
         points = np.where(is_sure[:, None], points, event.points)
     return points if event.sensor is None else points - event.sensor
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Residuals of m points before a correction, metres, and what was expected of them."""
+
+    r: FloatArray  # (m, k)
+    distances: FloatArray  # (m,) Mahalanobis distance of each
+    R: FloatArray  # (m, k, k) what of their covariance is that of the points, m²
+    S: FloatArray  # (m k, m k) their joint covariance, m²; empty if it is not known
+
+    @classmethod
+    def of(cls, gains: Gains, residuals: Residuals) -> Expected:
+        """Ask gains, before they correct the state."""
+        r, R = residuals.on(gains.axes)
+        if not len(r):
+            return cls(r, np.empty(0), R, np.empty((0, 0)))
+        if len(S := gains.innovation_covariance(residuals)):
+            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), R, S)
+        return cls(r, gains.distances(residuals), R, S)
+
+    def judge(self, weights: FloatArray, shares: FloatArray) -> NormalisedInnovation:
+        """Return how far off the residuals are, given the weights (m,) of the correction.
+
+        ``shares`` (m,) is what each is worth of an observation with new errors.
+        """
+        (m, k), used = self.r.shape, weights > 0.0
+        nis, log_densities = None, np.full(m, -np.inf)
+        if len(self.S) and used.any():
+            rows = np.flatnonzero(np.repeat(used, k))
+            L = cholesky(self.S[np.ix_(rows, rows)])
+            # One after the other, each as those before it have it: the product is that of all.
+            white = np.linalg.solve(L, self.r.ravel()[rows])
+            nis = float(white @ white)
+            each = 0.5 * white**2 + np.log(np.diagonal(L)) + LOG_ROOT_2_PI
+            log_densities[used] = -each.reshape(-1, k).sum(axis=1)
+        return NormalisedInnovation(
+            self.distances,
+            weights,
+            nis,
+            0 if nis is None else k * int(np.count_nonzero(used)),
+            log_densities,
+            shares,
+        )

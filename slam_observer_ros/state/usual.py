@@ -34,7 +34,7 @@ from slam_observer_ros.sensor_models.motion_noise import Factors
 from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.covariances import of_pose
-from slam_observer_ros.state.expected import Expected
+from slam_observer_ros.state.matching import Expected
 from slam_observer_ros.state.state import State
 
 MOST_WORK = 1e7

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slam_observer_ros.cli.simulate import LYAPUNOV_FLOOR
 from slam_observer_ros.evaluation.metrics import fit_decay
-from slam_observer_ros.runs.simulated_run import LYAPUNOV_FLOOR
 
 PAPER_SLOPE = -2.0 * (1.0 / 4.0) / np.log(10.0)
 

@@ -13,7 +13,7 @@ import pytest
 import robot
 from robot_report import Interruption
 
-from slam_observer_ros.nodes.message_classes import TFMessage
+from slam_observer_ros.nodes.ros_interface import TFMessage
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 

@@ -26,7 +26,7 @@ import pytest
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.estimator.timeline import MAX_PENDING_VELOCITIES, Timeline
+from slam_observer_ros.estimator.timeline import carried_forward, MAX_PENDING_VELOCITIES, Timeline
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
@@ -36,7 +36,6 @@ from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state import step as state_step
-from slam_observer_ros.state.late_observation import carried_forward
 from slam_observer_ros.state.matching import match
 from slam_observer_ros.state.state import State
 

@@ -24,7 +24,7 @@ from slam_observer_ros.geometry.matrices import diagonal_blocks
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import Parameter, table, Value
-from slam_observer_ros.state.tag_orientations import flipped
+from slam_observer_ros.state.step import flipped
 
 ROWS = table(Settings)
 

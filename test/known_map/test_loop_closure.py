@@ -9,8 +9,9 @@ import pytest
 
 from slam_observer_ros.association.assignments import find_assignments
 from slam_observer_ros.association.hypothesis import LandmarkIndex
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.observer.designs import make_gains
@@ -167,8 +168,8 @@ def test_that_a_loop_has_closed_is_logged(caplog):
     state, _ = after_a_loop(points_in_a_hall(0), np.arange(3, 10))
     estimator._hypotheses.reset(state)
     caplog.set_level('INFO', logger='slam_observer_ros')
-    estimator._close_loops(LOOP_NS + 10**9)
+    estimator._loop_closure.follow(estimator._state, LOOP_NS + 10**9, is_alone=True)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line == 'A loop has closed: 7 landmarks without ids were seen before.'
-    estimator._close_loops(LOOP_NS + 2 * 10**9)
+    estimator._loop_closure.follow(estimator._state, LOOP_NS + 2 * 10**9, is_alone=True)
     assert len(caplog.records) == 1

@@ -26,8 +26,8 @@ from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map import map_correlations, merging
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
+from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD

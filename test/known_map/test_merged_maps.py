@@ -16,7 +16,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.gauge import anchor
+from slam_observer_ros.observer.known_landmarks import anchor
 from slam_observer_ros.settings.estimator_settings import Settings
 
 

@@ -13,7 +13,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.tag_orientations import flipped
+from slam_observer_ros.state.step import flipped
 
 SIGMA_M, SIGMA_RAD = 0.02, 0.03
 SETTINGS = Settings(

@@ -25,7 +25,7 @@ from slam_observer_ros.messages.estimate_messages import (
     StateMessages,
     uncertain_pose,
 )
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter

@@ -26,7 +26,7 @@ from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.intake.transforms import LiveTransforms
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES
+from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES
 from slam_observer_ros.simulation import Scenario, Simulation
 
 pytestmark = pytest.mark.ros

@@ -30,14 +30,15 @@ from sensor_msgs.msg import Imu, PointCloud2
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import decode_twist, ODOMETRY
 from slam_observer_ros.nodes.intake import chosen_inputs
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 IMU = 'sensor_msgs/msg/Imu'

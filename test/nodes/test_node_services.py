@@ -25,12 +25,13 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import decode_point_cloud2
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher, MANY_UNUSED
+from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.runs.health import of_calibration
 from slam_observer_ros.simulation import Scenario
 

@@ -20,9 +20,9 @@ from random_runs import (
 from strategies import generators
 
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize, CHECK_INTERVAL
 from slam_observer_ros.observer.riccati.following_landmarks import REFERENCE_SHIFT_M

@@ -21,16 +21,15 @@ from random_runs import (
 )
 from strategies import generators
 
+from slam_observer_ros.cli.simulate import run_simulation
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.designs import DESIGNS
-from slam_observer_ros.observer.scheduled.core import CAPACITY
-from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
-from slam_observer_ros.observer.scheduled.scheduled import ScheduledGains
-from slam_observer_ros.runs.simulated_run import run_simulation
+from slam_observer_ros.observer.scheduled import ScheduledGains
+from slam_observer_ros.observer.scheduled_core import CAPACITY, PostponedLandmarks
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
 

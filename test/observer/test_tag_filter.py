@@ -11,9 +11,9 @@ from random_runs import observe, PLAIN, propagate, random_covariances
 from strategies import generators
 
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
-from slam_observer_ros.state.tag_orientations import flipped
+from slam_observer_ros.state.step import flipped
 
 TAGS = replace(PLAIN, use_tag_orientation=True)
 PLANAR_TAGS = replace(TAGS, two_d_mode=True)

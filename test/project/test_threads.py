@@ -8,8 +8,10 @@ import subprocess
 import sys
 
 import pytest
+import threadpoolctl
 
 from slam_observer_ros.common.process import CHOICES
+from slam_observer_ros.estimator import estimator  # noqa: F401  # loads what computes in threads
 
 NODE = """
 import sys
@@ -56,3 +58,10 @@ def test_programs_compute_in_one_thread(program):
 @pytest.mark.parametrize('program', [COMMAND, pytest.param(NODE, marks=pytest.mark.ros)])
 def test_the_environment_has_the_last_word(program):
     assert threads_of(program, OMP_NUM_THREADS='2') == threads_of(LIBRARY, OMP_NUM_THREADS='2')
+
+
+def test_the_tests_compute_in_one_thread():
+    """As many workers as cores with a thread a core each wait for each other most of the time."""
+    if any(os.environ.get(name, '1') != '1' for name in CHOICES):
+        pytest.skip('the environment says otherwise')
+    assert {pool['num_threads'] for pool in threadpoolctl.threadpool_info()} == {1}

@@ -9,8 +9,10 @@ import pytest
 
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.sensor_models.fiducial_noise import orientation_covariances
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.sensor_models.observation_noise import (
+    ObservationNoise,
+    orientation_covariances,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SETTINGS = Settings(

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from slam_observer_ros.state.expected import Expected
+from slam_observer_ros.state.matching import Expected
 
 
 def expected(m=3, k=2):

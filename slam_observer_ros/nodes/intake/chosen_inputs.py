@@ -33,7 +33,7 @@ from slam_observer_ros.messages.poses import (
 from slam_observer_ros.messages.registry import Decode, decoders
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
-from slam_observer_ros.nodes.message_classes import is_installed, message_class
+from slam_observer_ros.nodes.ros_interface import is_installed, message_class
 from slam_observer_ros.settings.input_settings import (
     AUTO,
     message_types,

@@ -20,7 +20,7 @@ from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.lateness import Backlog, LoadShedding, Waiting
-from slam_observer_ros.nodes.message_classes import message_class
+from slam_observer_ros.nodes.ros_interface import message_class
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.

@@ -16,7 +16,7 @@ from slam_observer_ros.inputs.frames import ALWAYS_NS, insert_transforms, Transf
 from slam_observer_ros.messages.poses import decode_transforms
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.input_topic import take
-from slam_observer_ros.nodes.message_classes import TFMessage
+from slam_observer_ros.nodes.ros_interface import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 TF_QOS = QoSProfile(depth=100)

@@ -27,13 +27,13 @@ from slam_observer_ros.messages.estimate_messages import (
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.input_topic import rivals
-from slam_observer_ros.nodes.message_classes import (
+from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
+from slam_observer_ros.nodes.ros_interface import (
     LATCHED_POSE_QOS,
     LATCHED_QOS,
     MESSAGES,
     RELIABLE_QOS,
 )
-from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 SLACK = 0.5

@@ -14,7 +14,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.message_classes import LATCHED_QOS
+from slam_observer_ros.nodes.ros_interface import LATCHED_QOS
 from slam_observer_ros.runs.health import of_fit
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -15,7 +15,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import TransformBuffer
 from slam_observer_ros.messages.estimate_messages import encode_transform
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.message_classes import RELIABLE_QOS, TFMessage
+from slam_observer_ros.nodes.ros_interface import RELIABLE_QOS, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 SENT = 10  # messages that may be on their way back at once

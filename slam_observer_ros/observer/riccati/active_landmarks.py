@@ -1,7 +1,7 @@
-"""Which landmarks are active in a large map: those in P, and how others take their place.
+"""Active landmarks of a large map, which are in P, and how others take their place.
 
-Motions and observations change P alone. What they have yet to do to all others is gathered in
-columns of P that nothing else acts on: see :mod:`.postponed_correction`.
+Motions and observations change P alone. Their effect on all other landmarks is gathered in columns
+of P that nothing else acts on, and comes later: see :mod:`.postponed_correction`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric
-from slam_observer_ros.observer.arrays import FilterArrays
+from slam_observer_ros.observer.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
-from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 CHECK_INTERVAL = 20
-"""Observations in which each landmark is looked at once, whether it is near its reference."""
+"""Observations in which each landmark is compared with its reference once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +56,7 @@ class ActiveLandmarks(JointCovariance):
         observer.postponed = self
 
     def copy(self, observer: FilterArrays) -> Self:
-        """Return an independent copy, which shares what takes much memory until it changes."""
+        """Return an independent copy; it shares large arrays until they change."""
         other = super().copy(observer)
         other._observer, observer.postponed = observer, other
         other._following = self._following.copy(observer)
@@ -74,7 +73,7 @@ class ActiveLandmarks(JointCovariance):
     # The step
 
     def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
-        """Update P by what has been projected; return K r of pose, calibration, active ones."""
+        """Update P by H P; return K r of pose, calibration and active landmarks."""
         Kr = super().update(HP, S, r)
         if len(r):
             self.follow(-Kr)
@@ -86,7 +85,10 @@ class ActiveLandmarks(JointCovariance):
         return places
 
     def follow(self, x: FloatArray) -> None:
-        """Let all others follow when the state is moved by exp(x), of which ``first`` count."""
+        """Let landmarks outside P follow a move of the state by exp(x).
+
+        Only the entries of x before ``first`` count.
+        """
         turn = self._axes.full_pose(x[: self._p])[:3]
         self._postponed.move(turn, x[self._entries])
         self._following.work()
@@ -109,7 +111,7 @@ class ActiveLandmarks(JointCovariance):
         self._has_moved = False  # once is enough, however often an observation is looked at
 
     def _check_references(self) -> None:
-        """Refer to present estimates if some of those that it is the turn of are far off."""
+        """Let references be present estimates, if some of the next panels are far from theirs."""
         self._checks += 1
         if not self._outside.unchanged:
             first = self._checks % CHECK_INTERVAL
@@ -152,9 +154,9 @@ class ActiveLandmarks(JointCovariance):
         return np.flatnonzero(self._places < 0)
 
     def _chosen(self, rows: IntArray) -> IntArray:
-        """Return the landmarks to be active when ``rows`` (m,) are seen."""
+        """Return which landmarks should be active when ``rows`` (m,) are seen."""
         kept = max(self._size.kept, self._size.kept_per_seen * len(rows))
-        # But landmarks that are just being added; a postponed shift makes no difference here.
+        # Without landmarks that are just being added; a postponed shift makes no difference here.
         observer, n = self._observer, len(self._places)
         arms = observer.y_ref[:n] + observer.a[:n] - observer.A[:3, 3]
         distances = np.einsum('ij,ij->i', arms, arms)
@@ -172,12 +174,12 @@ class ActiveLandmarks(JointCovariance):
         self._take_in(rows[self._places[rows] < 0])
 
     def _apply(self) -> None:
-        """Do what is postponed; refer to present estimates."""
+        """Do all postponed work; let references be present estimates."""
         self._restart(self.active[:0])
         self._following.finish()
 
     def _restart(self, released: IntArray) -> None:
-        """Let x start again, without landmarks (m,), and all else be changed little by little."""
+        """Let x start again, without landmarks (m,); change all others little by little."""
         self._following.finish()
         outside, P, p, angles = self._outside, self.P, self._p, self._p - self._axes.point
         all_slots = self._following.slots.copy()
@@ -243,16 +245,16 @@ class ActiveLandmarks(JointCovariance):
 
     @property
     def _x(self) -> IntArray:
-        """Which entries of P are those of x."""
+        """Columns of x in P."""
         return np.append(np.arange(self.chart.robot), np.arange(self.first, len(self.P)))
 
     @property
     def _entries(self) -> slice:
-        """Those of what is postponed."""
+        """Columns of the postponed corrections in P."""
         return slice(self.chart.robot, self.first)
 
     def _start(self, P: FloatArray) -> None:
-        """Let x have the covariance P from now on, and postpone what it has to do to others."""
+        """Let x have the covariance P from now on; postpone its effect on other landmarks."""
         count, robot = self._outside.size, self.chart.robot
         self._following.start(np.diagonal(P)[:count])
         self.P = P

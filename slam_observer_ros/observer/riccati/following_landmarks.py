@@ -1,7 +1,6 @@
-"""Landmarks out of view as they are now, and what is left to be done to them.
+"""Landmarks out of view, to which corrections and changes of x come later, panel by panel.
 
-Corrections of x and its changes come to them later, panel by panel. A view (:class:`.View`) shows
-what becomes of them, and does nothing.
+A view (:class:`.View`) shows them as they will be then, and changes nothing.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ REFERENCE_SHIFT_M = 0.1
 """How far estimates of landmarks out of view may be from their references."""
 
 CHANGE_INTERVAL = 64
-"""Corrections in which a change comes to all landmarks, if no other one has to begin before."""
+"""Corrections until a change has come to all landmarks, if no other has to begin before."""
 
 FOLDING = 3e7
 """Multiplications by which postponed corrections are worked off at each correction, at least."""
 
 
 class FollowingLandmarks:
-    """The landmarks of an observer that are not in P, and what has yet to be done to them."""
+    """The landmarks of an observer that are not in P, with the work that is postponed."""
 
     def __init__(self, chart: Chart, observer: FilterArrays) -> None:
         self._axes, self._stride, self._has_turns = chart.axes, chart.stride, chart.turn > 0
@@ -52,7 +51,7 @@ class FollowingLandmarks:
         return other
 
     def start(self, variances: FloatArray) -> None:
-        """Postpone from now on what corrections of x, of ``variances``, have to do to them."""
+        """Postpone from now on the effect of corrections of x, whose ``variances`` these are."""
         self.postponed = PostponedCorrection(variances, self._axes.point, self._has_turns)
 
     # Slots
@@ -64,7 +63,7 @@ class FollowingLandmarks:
         self._in_slots[slots[outside]] = outside
 
     def _in_panel(self, number: int) -> tuple[IntArray, BoolArray]:
-        """Return landmarks (slots,) of a panel, and which of them are there; others are any."""
+        """Return the landmark of each slot (slots,) of a panel, and which slots have one."""
         each = self.outside.slots_each
         rows = self._in_slots[each * number : each * (number + 1)]
         return rows, rows >= 0
@@ -72,7 +71,7 @@ class FollowingLandmarks:
     # Views
 
     def views(self, rows: IntArray) -> list[View]:
-        """Return what landmarks (m,) out of view are now, panel by panel in ascending order."""
+        """Return landmarks (m,) out of view as they are now, panel by panel, ascending."""
         views, outside, k = [], self.outside, self._axes.point
         for number, local in outside.by_panel(self.slots[rows]):
             in_panel, are_out = self._in_panel(number)
@@ -146,7 +145,10 @@ class FollowingLandmarks:
     # Changes
 
     def are_near(self, numbers: range) -> bool:
-        """Return whether landmarks of panels are near their references; turn tags until not."""
+        """Return whether landmarks of panels are near their references.
+
+        Tags of the panels that are found near are turned.
+        """
         for number in numbers:
             rows, are_out = self._in_panel(number)
             X = self.outside.complete(number, are_out)
@@ -160,7 +162,7 @@ class FollowingLandmarks:
         return True
 
     def work(self) -> None:
-        """Do some of what is left to be done."""
+        """Do a share of the postponed work."""
         outside = self.outside
         share = -(-len(outside.panels) // CHANGE_INTERVAL)
         for number in list(outside.unchanged)[: max(share - self._changed, 0)]:
@@ -169,12 +171,12 @@ class FollowingLandmarks:
         outside.matrix.fold(FOLDING)
 
     def finish(self) -> None:
-        """Do all of it that is not only folding."""
+        """Do all postponed changes; only folding may be left."""
         for number in list(self.outside.unchanged):
             self._change(number)
 
     def catch_up(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Do all that is left to be done to landmarks in slot order; return what they have joined.
+        """Do all postponed work on landmarks in slot order; return :meth:`joined` of them.
 
         Their panels keep all columns of X.
         """
@@ -190,7 +192,7 @@ class FollowingLandmarks:
         return self.joined(rows, views)
 
     def _change(self, number: int) -> None:
-        """Do what is left to be done to the landmarks of a panel."""
+        """Do the postponed change of a panel."""
         rows, are_out = self._in_panel(number)
         moved = self._moved(number, rows, are_out)
         self._observer.a[rows[are_out]] += moved.shifts[are_out]

@@ -1,9 +1,9 @@
 """Riccati gains of landmarks that may have orientations, as tags do.
 
 The orientations seen correct it by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the coordinates of
-:mod:`.chart` that is H x with a constant H, too. Then the points do, as ever. Both noises
-are taken to be independent, so to first order that is the same as both at once. Covariances
-(m, 3, 3) are those of rotation vectors, rad².
+:mod:`.chart` that is H x with a constant H, too. Points correct it afterwards, as ever. Both
+noises are taken to be independent, so to first order that is the same as both at once. Covariances
+(m, 3, 3) of rotation vectors are in rad².
 """
 
 from __future__ import annotations
@@ -15,14 +15,11 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.observer.arrays import flip_verdicts, SeenOrientations
 from slam_observer_ros.observer.gains import Errors, Gains, TagGains
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.orientations import (
-    flip_verdicts,
-    SeenOrientations,
-)
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 
@@ -72,7 +69,7 @@ class OrientationGains(Gains):
         """Move the state by exp(x)."""
 
     def learn_motion_noise(self, residuals: Residuals) -> None:
-        """Let residuals show how noisy the motion was, if something else than them corrects it."""
+        """Let residuals show how noisy the motion was, before something else corrects it."""
         if len(residuals.rows):
             S = self.errors.innovation_covariance(residuals)
             self._learn_motion_noise(residuals, residuals.on(self.axes)[0], S)
@@ -83,10 +80,10 @@ class OrientationGains(Gains):
         self.motion_noise.factors.learn(r, S, C)
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
-        """Move the state by what is seen of known orientations.
+        """Correct the state by known orientations that were seen.
 
-        Return the weight (m,) of each, and which of them are left out as they, and their flipped
-        twins, are both likely.
+        Return the weight (m,) of each, and which are left out: those whose flipped twins are
+        likely, too.
         """
         phi, R = self._turns(seen.rows, seen.Z), self._noise(seen.covariances)
         _, predicted = self.joint.project_turns(seen.rows, seen.D)

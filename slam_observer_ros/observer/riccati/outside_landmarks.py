@@ -1,9 +1,9 @@
-"""Landmarks that are out of view, and how they depend on the local state x of those in view.
+"""Landmarks out of view, and how they depend on the local state x of the others.
 
-Each has the error η_i = ξ_i − [y_i°]× ε_Ω, that of its position with a reference y_i°: it does not
-move while the robot does; that of a tag's orientation is ω_i itself. Each is kept in a slot, some
-rows of all arrays, which it keeps while it is in view, too; what is there is out of date then, and
-X is zero. What has to be done to all of them is done panel by panel (:class:`Change`).
+The error of a landmark's position is η_i = ξ_i − [y_i°]× ε_Ω, with a reference y_i°: it does not
+move while the robot does. The error of a tag's orientation is ω_i itself. A landmark has a slot,
+some rows of all arrays, and keeps it while it is in view: these rows are out of date then, and X
+is zero there. A change of all landmarks is made panel by panel (:class:`Change`).
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from slam_observer_ros.observer.riccati.postponed_correction import PostponedCor
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """What has yet to be done to all landmarks as x started again: (q,) entries, then fewer."""
+    """A change of all landmarks, begun when x started again: with q entries, then fewer."""
 
-    postponed: PostponedCorrection  # until then
+    postponed: PostponedCorrection  # corrections until then
     Phi: FloatArray  # (q, q₀)
     root: FloatArray  # (q₀, r) of Ψ
     taken: IntArray  # slots that are the last columns of X until then
     turns: FloatArray  # (s, q) covariance of the angles of ε with x
     kept: IntArray  # entries of x that stay
-    slots: IntArray  # (m,) landmarks that are not in x any more, ascending
-    points: FloatArray  # (m, 3) their references
-    rows: IntArray  # (m k,) and rows
-    columns: IntArray  # (m k,) and entries of x
+    slots: IntArray  # (m,) slots of landmarks that are not in x any more, ascending
+    points: FloatArray  # (m, 3) references of these landmarks
+    rows: IntArray  # (m k,) their rows of B
+    columns: IntArray  # (m k,) entries of x that they were
     turning: FloatArray  # (m k, p) T of η = ξ − T ε
-    own: FloatArray  # (m k, m k) their own
-    to_x: FloatArray  # (m k, …) and with the entries that stay
+    own: FloatArray  # (m k, m k) their covariance
+    to_x: FloatArray  # (m k, …) their covariance with the entries that stay
 
     @property
     def weights(self) -> FloatArray:
@@ -49,10 +49,10 @@ class Change:
 class Panel:
     """The landmarks of a panel. Its arrays are never changed in place: copies share them."""
 
-    X: FloatArray  # (PANEL_ROWS, …) cov(η, x₀), and the first of the columns that are taken
+    X: FloatArray  # (PANEL_ROWS, …) cov(η, x₀), then the columns of η taken in, maybe not all
     own: FloatArray  # (slots, k, k) diagonal blocks of B
     references: FloatArray  # (slots, 3) y_i°, metres
-    turned: int = 0  # corrections since x began by which tags have been turned
+    turned: int = 0  # how many corrections since x began have turned the tags
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,22 +61,22 @@ class Moved:
 
     panel: Panel
     shifts: FloatArray  # (slots, 3) how far estimates have been moved, metres
-    turns: FloatArray  # (slots, 3, 3) and turned
+    turns: FloatArray  # (slots, 3, 3) how orientations have been turned
     U: FloatArray  # (PANEL_ROWS, r + 2 s) to be added to B
-    V: FloatArray  # (PANEL_ROWS, m k) the columns of B of those that are not in x any more
+    V: FloatArray  # (PANEL_ROWS, m k) columns of B of the landmarks that are not in x any more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Landmarks of a panel (m,) as they are now, whatever has yet to happen."""
+    """Landmarks (m,) of a panel as they are now, after all that is postponed."""
 
     rows: IntArray  # (m,) which landmarks
     X: FloatArray  # (m, k, …) with all columns
     own: FloatArray  # (m, k, k)
     references: FloatArray  # (m, 3) metres
     shifts: FloatArray  # (m, 3) how far estimates have yet to be moved, metres
-    turns: FloatArray  # (m, 3, 3) and be turned
-    moved: Moved | None  # what is left to be done to their panel
+    turns: FloatArray  # (m, 3, 3) how orientations have yet to be turned
+    moved: Moved | None  # their panel after the change that it waits for
 
 
 class OutsideLandmarks:
@@ -92,7 +92,7 @@ class OutsideLandmarks:
         self.panels: list[Panel] = []
         self.size = 0  # q₀
         self.taken: IntArray = np.empty(0, dtype=np.int64)  # (t,) slots
-        self.unchanged: dict[int, Change] = {}  # panels to which one has yet to happen
+        self.unchanged: dict[int, Change] = {}  # panels that wait for a change
         self._unused: list[int] = []
         self._left: list[int] = []  # slots of landmarks that were removed
 
@@ -111,7 +111,7 @@ class OutsideLandmarks:
 
     @property
     def width(self) -> int:
-        """How many columns X has, with those that some panels do not have yet."""
+        """How many columns X has; some panels may not have the last ones yet."""
         return self.size + self._stride * len(self.taken)
 
     def rows(self, slots: IntArray) -> IntArray:
@@ -125,7 +125,7 @@ class OutsideLandmarks:
         return np.sort(np.append(used, self._unused_slots(count - len(used)))).astype(np.int64)
 
     def _unused_slots(self, count: int) -> IntArray:
-        """Return slots of which B is zero, ascending."""
+        """Return so many slots, ascending, where B is zero."""
         each, k = self.slots_each, self._stride
         while len(self._unused) < count:
             self._unused += range(each * len(self.panels), each * (len(self.panels) + 1))
@@ -136,7 +136,7 @@ class OutsideLandmarks:
         return np.array(slots, dtype=np.int64)
 
     def remove(self, slots: IntArray) -> None:
-        """Forget landmarks. What B has of them is replaced with that of others."""
+        """Forget landmarks; others will take their rows of B."""
         self.clear(slots)
         self._left += slots.tolist()
 
@@ -153,7 +153,7 @@ class OutsideLandmarks:
         self.taken = np.append(self.taken, slots)
 
     def by_panel(self, slots: IntArray) -> list[tuple[int, IntArray]]:
-        """Return panels, and which of their slots are among these."""
+        """Return the panels of some slots, and the slots within each panel."""
         numbers = slots // self.slots_each
         return [
             (int(number), slots[numbers == number] % self.slots_each)
@@ -182,7 +182,7 @@ class OutsideLandmarks:
         self._set_own(slots, entries, covariances)
 
     def _set_own(self, slots: IntArray, entries: slice, covariances: FloatArray) -> None:
-        """Set what landmarks, ascending, have on the diagonal of B, where nothing is."""
+        """Set the diagonal blocks of B of landmarks, ascending, which are zero."""
         begin = 0
         for number, local in self.by_panel(slots):
             blocks, panel = covariances[begin : begin + len(local)], self.panels[number]
@@ -202,7 +202,7 @@ class OutsideLandmarks:
             begin += len(local)
 
     def among(self, slots: IntArray, views: list[View]) -> FloatArray:
-        """Return B (m k, m k) of landmarks, ascending, of which these are the views."""
+        """Return B (m k, m k) of landmarks, ascending, given their views."""
         rows, parts = self.rows(slots), self.by_panel(slots)
         U = [self.matrix.rows_of_U(number) for number, _ in parts]
         for i, view in enumerate(views):
@@ -234,7 +234,7 @@ class OutsideLandmarks:
             self.matrix.end()
 
     def moved(self, number: int, points: FloatArray, are_out: BoolArray) -> Moved:
-        """Return what a change makes of a panel; landmarks that ``are_out`` are not in x.
+        """Return a panel after its change; landmarks that ``are_out`` are not in x.
 
         The change has not yet moved the estimates ``points`` (slots, 3) of its landmarks.
         """
@@ -285,7 +285,7 @@ class OutsideLandmarks:
         return X
 
     def completed(self, number: int, are_out: BoolArray, moved: Moved | None = None) -> FloatArray:
-        """Return the same of a panel that may have been moved, which has yet to happen."""
+        """Return X of a panel with all its columns, maybe after a change it waits for."""
         if moved is None:
             return self._completed(number, self.size, self.taken, are_out)
         rows, changed = self.rows(np.sort(self.taken)), self.unchanged[number].rows
@@ -299,7 +299,7 @@ class OutsideLandmarks:
     def _completed(
         self, number: int, size: int, taken: IntArray, are_out: BoolArray
     ) -> FloatArray:
-        """Return X of a panel as x was: of ``size`` entries, and ``taken`` since."""
+        """Return X of a panel for x of ``size`` entries at its start, and ``taken`` since."""
         X = self.panels[number].X
         rest = taken[(X.shape[1] - size) // self._stride :]
         if not len(rest):

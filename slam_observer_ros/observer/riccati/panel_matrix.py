@@ -1,10 +1,10 @@
 """A large symmetric matrix to which products of low rank are added, a little at a time.
 
-It is M = B + U diag(w) Uᵀ. Rows are in panels, and of B those up to the diagonal are kept, in
-square tiles; so it grows without a copy, and takes half the memory. U has what is yet to be added
-to B, which costs O(N²) for N rows: that is done panel by panel (:meth:`PanelMatrix.fold`). So is U
-itself made: columns that are *begun* have been given to some panels, and not yet to others, of
-which M is then still what it was before. No array is changed in place: copies share them.
+It is M = B + U diag(w) Uᵀ. Its rows are in panels. B is kept up to its diagonal, in square tiles:
+so it grows without a copy, and takes half the memory. Adding U diag(w) Uᵀ to B costs O(N²) for N
+rows, and is done panel by panel (:meth:`PanelMatrix.fold`). U grows panel by panel, too: columns
+that are *begun* have been given to some panels, and M is what it was before in the others. No
+array is changed in place: copies share them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class PanelMatrix:
     """M (N, N) with N a multiple of ``PANEL_ROWS``; at first there is none."""
 
     def __init__(self) -> None:
-        # Of each panel the tiles (PANEL_ROWS, PANEL_ROWS) of B up to that on the diagonal
+        # Of each panel the tiles (PANEL_ROWS, PANEL_ROWS) of B, up to the one on the diagonal
         self._tiles: list[list[FloatArray]] = []
         self._zeros = np.zeros((PANEL_ROWS, PANEL_ROWS))
         self._folded: list[int] = []  # how many columns of U are already in each panel
@@ -57,7 +57,7 @@ class PanelMatrix:
     def columns(self, number: int, indices: IntArray, U: FloatArray | None = None) -> FloatArray:
         """Return the rows of a panel (PANEL_ROWS, m) at ascending ``indices`` (m,) of columns.
 
-        ``U`` are its rows of U if these are not those that it has.
+        ``U`` are to be its rows of U, by default those that it has.
         """
         found = np.empty((PANEL_ROWS, len(indices)))
         for part, other, local in _by_panel(indices):
@@ -69,7 +69,7 @@ class PanelMatrix:
         return found
 
     def set_columns(self, number: int, indices: IntArray, values: FloatArray) -> None:
-        """Replace them by ``values`` (PANEL_ROWS, m), and with them the same rows."""
+        """Replace these columns by ``values`` (PANEL_ROWS, m), and the same rows likewise."""
         for part, other, local in _by_panel(indices):
             new = values[:, part] - self._pending(number, other, local)
             tile = self._writable(max(number, other), min(number, other))
@@ -95,7 +95,7 @@ class PanelMatrix:
 
     @property
     def columns_of_U(self) -> int:  # noqa: N802 (as in the formula)
-        """How many columns U has, with those that some panels do not have yet."""
+        """How many columns U has; some panels may not have the last ones yet."""
         return len(self._w)
 
     def rows_of_U(self, number: int) -> FloatArray:  # noqa: N802 (as in the formula)
@@ -103,7 +103,7 @@ class PanelMatrix:
         return self._U[number]
 
     def begin(self, w: FloatArray) -> None:
-        """Begin to add U diag(w) Uᵀ, of which :meth:`add` gives each panel its rows of U."""
+        """Begin to add U diag(w) Uᵀ; :meth:`add` gives each panel its rows of U."""
         self._w = np.append(self._w, w)
 
     def add(self, number: int, U: FloatArray) -> None:
@@ -111,11 +111,11 @@ class PanelMatrix:
         self._U[number] = np.hstack([self._U[number], U])
 
     def end(self) -> None:
-        """Let it be known that all panels have theirs."""
+        """Note that all panels have their rows of U."""
         self._rank = len(self._w)
 
     def fold(self, work: float) -> None:
-        """Go on adding U to the panels, one or as many as ``work`` multiplications suffice for."""
+        """Go on adding U to panels: one, or as many as ``work`` multiplications allow."""
         # How much is done at a time may not depend on the clock: a replay has the same bits.
         if not self._target and self._rank < FOLDED_RANK:
             return

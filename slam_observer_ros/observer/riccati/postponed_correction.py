@@ -1,20 +1,20 @@
-"""What corrections of a local state have yet to do to errors that depend on it.
+"""Corrections of a local state x whose effect on errors η of other landmarks is postponed.
 
-Errors η of landmarks out of view do not move, and are observed only through those of the local
-state x. With X = cov(η, x) at the instant from which on corrections are postponed, a correction
-of x, H x being observed with the covariance S and the residual r, leaves
+Landmarks out of view do not move, and only x shows anything of their errors η. Let X = cov(η, x)
+at the instant from which on corrections are postponed. After a correction of x by the residual r
+of H x, with the covariance S,
 
     cov(η, x) = X Φᵀ,    Φ ← Φ − K H Φ
     cov(η)    = B − X Ψ Xᵀ,    Ψ ← Ψ + (H Φ)ᵀ S⁻¹ H Φ
     η̂         moved by  −X g,    g = (H Φ)ᵀ S⁻¹ r,
 
-whatever η is and however many of them there are. Where some of the η become part of x, X has the
-columns cov(η, η_i) of B, too: Φ and Ψ grow by these. With K = P Hᵀ S⁻¹ all that is what happens to
-columns more of P that no H looks at: [P Φ; Φᵀ −Ψ] is corrected like P, and K r is g there. So that
-is where Φ and Ψ are kept, and here the rest. On the group, X̂ ← exp(−K r) · X̂, the shift
-a of a landmark since its reference becomes D a − J X_i g, with D = exp(ε_Ω) and its left
-Jacobian J; over many corrections D₁ a + T X_i, with a tensor T. A tag's orientation turns by
-exp(−X_i g) each time. See docs/theory.md, Large maps.
+for any η, and however many there are. Where some η_i become part of x, X has the columns
+cov(η, η_i) of B, too, and Φ and Ψ grow by these. With K = P Hᵀ S⁻¹ the matrix [P Φ; Φᵀ −Ψ] is
+corrected as P is, by an H that is zero in the new columns, where K r is g. So Φ and Ψ are kept as
+columns of P, and the rest here. On the group, X̂ ← exp(−K r) · X̂, the shift a of a
+landmark from its reference becomes D a − J X_i g, with D = exp(ε_Ω) and its left Jacobian J;
+over many corrections D₁ a + T X_i, with a tensor T. A tag's orientation turns by exp(−X_i g) each
+time. See docs/theory.md, Large maps.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from slam_observer_ros.geometry.axes import EstimatedAxes
 
 
 class PostponedCorrection:
-    """D (k, k) and T (k, k, q₀) since x had q₀ entries, of these ``variances``."""
+    """D (k, k) and T (k, k, q₀) since x had q₀ entries, with these ``variances``."""
 
     def __init__(self, variances: FloatArray, point: int, have_turns: bool = False) -> None:
-        # Of each correction g (q₀ of then,), by which the orientations of tags turn
+        # g of each correction, which turns the orientations of tags; as long as x was then
         self.gains: list[FloatArray] | None = [] if have_turns else None
         self.turn: FloatArray = np.eye(point)
         self.shift: FloatArray = np.zeros((point, point, len(variances)))
@@ -59,7 +59,7 @@ class PostponedCorrection:
             self.gains.append(-minus_g)
 
     def shifted(self, a: FloatArray, X: FloatArray) -> FloatArray:
-        """Return what shifts a (n, k) have become, of landmarks with X (n, k, q₀)."""
+        """Return the shifts (n, k) now of landmarks with X (n, k, q₀) that had shifts a."""
         T = self.shift.reshape(len(self.turn), -1)
         moved: FloatArray = a @ self.turn.T + X.reshape(len(a), -1) @ T.T
         return moved
@@ -75,7 +75,7 @@ class PostponedCorrection:
             row[: len(g)] = g
         omega = -(X.reshape(n * q, -1) @ G.T).reshape(n, q, count).swapaxes(1, 2)
         R = so3.exp(axes.full_turns(omega.reshape(-1, q))).reshape(n, count, 3, 3)
-        # One after the other: the product of all is that of the products of two neighbours.
+        # The product of all, by halves: first of each with its neighbour.
         while R.shape[1] > 1:
             last = R[:, R.shape[1] // 2 * 2 :]
             R = np.concatenate([R[:, 1::2] @ R[:, : R.shape[1] // 2 * 2 : 2], last], axis=1)
@@ -83,7 +83,7 @@ class PostponedCorrection:
         return turns
 
     def take(self, variances: FloatArray) -> None:
-        """Let X have columns (m,) more, of entries with these variances."""
+        """Let X have m more columns, for entries with these variances."""
         self.shift = np.pad(self.shift, ((0, 0), (0, 0), (0, len(variances))))
         self._deviations = np.append(self._deviations, np.sqrt(np.maximum(variances, 0.0)))
 
@@ -91,7 +91,7 @@ class PostponedCorrection:
         """Return F (q₀, r) with F Fᵀ = Ψ up to rounding, r being the rank of Ψ."""
         if not len(Psi):
             return Psi
-        # In units of standard deviations, as those of angles and positions differ by far.
+        # In standard deviations, as the units of angles and positions differ by far.
         scaled = self._deviations[:, None] * Psi * self._deviations
         L, order, rank, _ = dpstrf(scaled, lower=1)
         F = np.zeros((len(scaled), rank))

@@ -5,11 +5,11 @@ of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i f
 
     H_i = [ 0  I  0 … −I … 0 ],
 
-or with R̂ D_i at the calibration of the sensor that saw it (:mod:`.calibration`), and what
-no observation can determine, the choice of the world's frame, is exactly in its null space: the
+with R̂ D_i besides at the calibration of the sensor that saw it (:mod:`.calibration`). The
+choice of the world's frame, which no observation can determine, is exactly in its null space: the
 covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
 X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
-in large maps less: :mod:`.compressed_covariance`.
+in large maps less: :class:`.CompressedCovariance`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,14 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import block_diagonal, solve_symmetric, with_blocks
+from slam_observer_ros.observer.arrays import UNKNOWN_RAD
 from slam_observer_ros.observer.chart import Chart
 from slam_observer_ros.observer.gains import Errors, OF_CONSTANT_GAINS
-from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.joint_covariance import JointCovariance
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.orientations import UNKNOWN_RAD
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.known_landmarks import anchor, KnownLandmarks
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
-from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
-from slam_observer_ros.observer.riccati.exact_map import ExactMapCovariance
+from slam_observer_ros.observer.riccati.covariances import CompressedCovariance, ExactMapCovariance
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.observer.robust import AT_ONCE, observation_weights
 from slam_observer_ros.sensor_models.motion import Motion
@@ -57,8 +55,8 @@ class RiccatiGains(OrientationGains):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        # What is estimated of each landmark beside its position, and how little is known of it:
-        # its velocity, or the orientation of a tag at rest.
+        # Beside its position a landmark's velocity is estimated, or the orientation of a tag at
+        # rest; both are unknown at first.
         speed = settings.landmark_velocity_stddev
         velocity = self.axes.point if speed else 0
         has_turns = settings.use_tag_orientation and not speed
@@ -74,7 +72,7 @@ class RiccatiGains(OrientationGains):
 
     @staticmethod
     def estimated(settings: Settings) -> Settings:
-        """Return the settings with as much of a calibration as is estimated: all."""
+        """Return the settings: all of a calibration is estimated."""
         return settings
 
     def copy(self) -> Self:
@@ -277,12 +275,12 @@ class RiccatiGains(OrientationGains):
 
     @property
     def calibration_variances(self) -> FloatArray:
-        """(c,) variances of what is estimated of the calibration."""
+        """(c,) variances of the calibration's estimates."""
         return self.joint.calibration_variances
 
     def _compress_if_large(self, added: int) -> None:
         """Go on with a covariance for many landmarks, unless they move or P has none of them."""
-        # Tags count by what is estimated of them: relinearising ends there, too.
+        # Tags count by their columns: relinearising ends there, too.
         count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
         is_large = count > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved

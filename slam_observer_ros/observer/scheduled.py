@@ -1,4 +1,4 @@
-"""Variance-scheduled gains: the paper's k_i and l_i, set by what is known, at O(m) for m seen.
+"""Variance-scheduled gains: the paper's k_i and l_i, set by variances, at O(m) for m points seen.
 
 Landmarks share little beyond the errors of the robot and of the landmarks near it. So a full
 covariance P is kept of the errors of a small *core* z = (ε, c, ã_1 … ã_K) alone: pose, calibration
@@ -14,8 +14,8 @@ the noise R_i of the observation, the gains of (30) and (31) become matrices
     l_i / k_i · dt = N_i (N_i + R_i)⁻¹,  δ_i = F_i Δ + N_i k_i (r_i + H_i Δ)
 
 where Δ is a step of all of z, and F_i ← F_i + N_i k_i H_i, N_i ← N_i − N_i k_i N_i. A landmark out
-of view keeps F_i and N_i, and follows by F_i Δ later (:mod:`.postponed_landmarks`). Where the core
-becomes another one (:mod:`.core`), what it no longer explains is added to each N_i as if it were
+of view keeps F_i and N_i, and follows by F_i Δ later (:mod:`.scheduled_core`). Where the core
+becomes another one (:class:`.Core`), what it no longer explains is added to each N_i as if it were
 its own. So P is not that of an exact filter, and not published. See docs/theory.md, Gain designs,
 which also has the origin: the compressed EKF and postponement.
 """
@@ -37,11 +37,10 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
 )
 from slam_observer_ros.observer.gains import Gains, OF_CONSTANT_GAINS, OF_JOINT_COVARIANCES
-from slam_observer_ros.observer.gauge import anchor
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.known_landmarks import anchor, KnownLandmarks
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, huber_weights, REWEIGHTINGS
-from slam_observer_ros.observer.scheduled.core import Core, regression
+from slam_observer_ros.observer.scheduled_core import Core, regression
 from slam_observer_ros.sensor_models.calibration import without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -80,7 +79,7 @@ class ScheduledGains(Gains):
 
     @staticmethod
     def estimated(settings: Settings) -> Settings:
-        """Return the settings with as much of a calibration as is estimated."""
+        """Return the settings without calibrations of sensors, which are not estimated."""
         return without_sensor_calibration(settings)
 
     def copy(self) -> Self:
@@ -135,7 +134,7 @@ class ScheduledGains(Gains):
     def add(
         self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
     ) -> None:
-        """Append landmarks (m,): their error is that of the pose and of the observation."""
+        """Append landmarks (m,): they have the errors of the pose and of the observation."""
         super().add(points, covariances)
         y_ref = self.observer.y_ref[-len(points) :]
         noise = self.observer.turned(covariances)
@@ -178,7 +177,7 @@ class ScheduledGains(Gains):
         self._core.set_pose_error_covariance(covariance[self.axes.pose, self.axes.pose])
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
-        """Move pose and map to where known landmarks are, by γ, see :mod:`.gauge`."""
+        """Move pose and map to where known landmarks are, by γ, see :mod:`.known_landmarks`."""
         # All are up to date, and z is the pose (and calibration): ã_i = F_i (z − γ) + J_i γ + η_i.
         self._core.dismiss(self._core.rows)
         everything, p = np.arange(len(self._postponed)), self.axes.p
@@ -192,7 +191,7 @@ class ScheduledGains(Gains):
         P[: gamma[0], : gamma[0]] = self._with_landmarks(F[rows], N[rows])
         G[:p] = G[gamma] = np.eye(p)
         G[known] = J[rows].reshape(-1, p)
-        # All of these corrected by what is known of the landmarks.
+        # All of these corrected by the known landmarks.
         S = P[np.ix_(known, known)] + block_diagonal(self._noise(covariances))
         x, P = anchor(P, G, P[:, known], S, G[known], r[:, :k].ravel())
         # γ = B z + ζ, so ã_i = F_i z + (J_i − F_i) γ + η_i depends on z by F_i + (J_i − F_i) B.
@@ -214,7 +213,7 @@ class ScheduledGains(Gains):
 
     @property
     def calibration_variances(self) -> FloatArray:
-        """(c,) variances of what is estimated of the calibration."""
+        """(c,) variances of the calibration's estimates."""
         p = self.axes.p
         variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
         return variances

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.observer.configuration import SMALL_RAD, turned_moment
+from slam_observer_ros.state.covariances import SMALL_RAD, turned_moment
 
 
 @pytest.mark.parametrize(('q', 'k'), [(1, 2), (3, 3)])

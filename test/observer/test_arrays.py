@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.observer.arrays import SymmetricMatrix
 
 
 @pytest.mark.parametrize('size', [3, 40, 300])

@@ -1,10 +1,11 @@
-"""The joint covariance of large maps: a dense one of few landmarks, others follow when needed.
+"""The joint covariance of large maps, and that in a map that is taken to be exact.
 
-P is that of pose, calibration and the landmarks that are *active*: near, or seen of late
-(:mod:`.active_landmarks`). What motions and observations do to it comes to all others when these
-become active. It is exact but for one thing: what the noise of a motion does to the error ξ_i of
-a landmark out of view is judged by a reference position, which is set again when the estimate is
-too far off (J. Guivant and E. Nebot, *Optimization of the SLAM algorithm for real-time
+The second is that of pose and calibration alone. The first is a dense one of few landmarks; others
+follow when needed: P is that of pose, calibration and the landmarks that are *active*: near, or
+seen of late (:mod:`.active_landmarks`). What motions and observations do to it comes to all others
+when these become active. It is exact but for one thing: what the noise of a motion does to the
+error ξ_i of a landmark out of view is judged by a reference position, which is set again when the
+estimate is too far off (J. Guivant and E. Nebot, *Optimization of the SLAM algorithm for real-time
 implementation*, 2001). As long as there are few landmarks all are active. How the others follow:
 :mod:`.following_landmarks`.
 """
@@ -17,18 +18,76 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.observer.arrays import SymmetricMatrix
 from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.joint_covariance import JointCovariance
+from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.riccati.active_landmarks import ActiveLandmarks
-from slam_observer_ros.observer.symmetric_matrix import SymmetricMatrix
+from slam_observer_ros.sensor_models.motion import Motion
+
+
+class ExactMapCovariance(JointCovariance):
+    """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
+
+    active = slice(0)
+    is_dense = is_of_points = False
+
+    def __init__(self, joint: JointCovariance, covariances: FloatArray) -> None:
+        chart = joint.chart.with_postponed(0)
+        super().__init__(chart, joint._matrix, joint.of_robot, joint._unknown)
+        self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
+
+    def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
+        """Return the covariances (n, 3, 3) of the landmarks, as the map has them."""
+        return self._covariances
+
+    def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray | None:
+        """Return None: how far the map is off, nobody knows."""
+        return None
+
+    def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
+        """Add a motion's noise to the covariance of the pose."""
+        motion.predict(self.P)
+
+    def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
+        """Return C_i of r_i = C_i (ε, c̃): [−[ŷ_i]×, I] of ε."""
+        return self.chart.output(residuals.landmarks + chord * residuals.r, residuals.D)
+
+    def change_of_residuals(self, residuals: Residuals, x: FloatArray) -> FloatArray:
+        """Return H x (m, k)."""
+        C = self.output_matrix(residuals)
+        change: FloatArray = C @ x[: C.shape[2]]
+        return change
+
+    def _project(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+        HP = C @ self.P[: C.shape[1]]
+        return HP, HP[:, : C.shape[1]] @ C.T
+
+    def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i (ε, c̃) alone."""
+        q = C.shape[-1]
+        PC = self.P[:q, :q] @ transpose(C)
+        return PC[..., : self._p, :], C @ PC
+
+    def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return :meth:`output` of all together, (p, m k) and (m k, m k)."""
+        return self.output(C.reshape(-1, C.shape[2]), rows)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget landmarks."""
+        self._covariances = np.delete(self._covariances, rows, axis=0)
+
+    def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃."""
+        super().set_pose(covariance, np.empty((0, 3)))
 
 
 class CompressedCovariance(ActiveLandmarks):
-    """What is known of all landmarks, wherever they are."""
+    """The covariance of all landmarks, active or not."""
 
     @property
     def references(self) -> FloatArray:
-        """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
+        """(n, 3) positions that errors are judged by: estimates of active landmarks, else y_i°."""
         points = self._observer.y_ref + self._observer.a
         for view in self._following.views(self._others):
             points[view.rows] = view.references
@@ -52,7 +111,7 @@ class CompressedCovariance(ActiveLandmarks):
         return with_pose, own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all together, (p, m k) and (m k, m k)."""
+        """Return :meth:`output` of all together, (p, m k) and (m k, m k)."""
         if (self._places[rows] >= 0).all():
             return super().outputs(C, rows)
         unique, at = np.unique(rows, return_inverse=True)
@@ -101,7 +160,7 @@ class CompressedCovariance(ActiveLandmarks):
         return self.marginal(every).of_landmarks(at, points, of_tags)
 
     def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
-        """Return what orientations ``B`` (m, 3, 3) of tags are with all that is postponed."""
+        """Return orientations ``B`` (m, 3, 3) of tags after all that is postponed."""
         every = np.tile(np.eye(3), (len(self._places), 1, 1))
         for view in self._following.views(np.unique(rows[self._places[rows] < 0])):
             every[view.rows] = view.turns
@@ -124,7 +183,7 @@ class CompressedCovariance(ActiveLandmarks):
     # All of it
 
     def dense(self) -> JointCovariance:
-        """Return the same with all landmarks in P, which the observer has moved."""
+        """Return the covariance with all landmarks in P, after the observer has moved them."""
         self._apply()
         joint = self.marginal(np.arange(len(self._places)))
         self.P, self._observer.postponed = joint.P, None
@@ -132,11 +191,11 @@ class CompressedCovariance(ActiveLandmarks):
         return joint
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
-        """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
+        """Let ε have the ``covariance`` (p, p), and be independent of c̃ and of all ã_i."""
         self._apply()
         P = super().of_positions(points[self.active])
         P = P[np.ix_(self._x, self._x)]
-        # Errors of all others are those of their positions now, too.
+        # All other landmarks have the errors ã_i of their positions now, too.
         p = self._p
         T = self._all_turning(points[self.active])
         for panel in self._outside.panels:
@@ -170,7 +229,7 @@ class CompressedCovariance(ActiveLandmarks):
         return joint
 
     def _of_others(self, rows: IntArray, q: int) -> tuple[FloatArray, FloatArray]:
-        """Return covariances with q first entries of x (m, k, q), own (m, k, k) of ξ_i outside."""
+        """Return covariances of ξ_i outside P: with the first q entries of x, own (m, k, k)."""
         X, own, references = self._following.each(rows, self.P[self._entries, self._entries])
         T, p = self._turning(references), self._p
         to_state = X @ self.P[self._entries, :q]
@@ -179,7 +238,7 @@ class CompressedCovariance(ActiveLandmarks):
         return to_state + T @ self.P[:p, :q], own
 
     def _known_blocks(self, covariances: FloatArray) -> FloatArray:
-        """Return the covariances (m, …, …) of all that is estimated of known landmarks."""
+        """Return the covariances (m, …, …) of known landmarks, with all their columns."""
         k, blocks = self._axes.point, np.zeros((len(covariances), self._stride, self._stride))
         blocks[:, :k, :k] = covariances[:, :k, :k]
         blocks[:, np.arange(k, self._stride), np.arange(k, self._stride)] = self._unknown

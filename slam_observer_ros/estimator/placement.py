@@ -1,0 +1,137 @@
+"""Where the estimate begins: at a pose that is given, in a loaded map, or at an unknown pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import logging
+
+import numpy as np
+
+from slam_observer_ros.association.hypotheses import Hypotheses
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.localiser import is_rough, Localiser
+from slam_observer_ros.observer.designs import make_gains
+from slam_observer_ros.settings.estimator_settings import LiveSettings
+from slam_observer_ros.state.state import State
+from slam_observer_ros.state.usual import Outcome
+
+logger = logging.getLogger(__name__)
+
+GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
+"""Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
+
+
+class Placement:
+    """Starts ``hypotheses``, and moves them into the frame of a map that the ``localiser`` has.
+
+    ``was_placed`` is whether somebody has said where the robot is, so that the pose of the
+    settings is not where it starts. ``judges_innovations`` is as for :class:`.Estimator`.
+    """
+
+    def __init__(self, settings: LiveSettings, judges_innovations: bool) -> None:
+        self._settings, self._judges_innovations = settings, judges_innovations
+        self.hypotheses = Hypotheses(self._state_at(np.eye(4)))
+        self.localiser = Localiser()
+        self.was_placed = False
+
+    def reset(self, pose: FloatArray | None) -> None:
+        """Start again at ``pose`` (4, 4); if None, where the settings say, or at identity.
+
+        In a loaded map it is unknown then, unless the settings say it.
+        """
+        self.was_placed = pose is not None
+        if pose is None and self._settings.set_initial_pose:
+            self._start_where_settings_say()
+        else:
+            self.start(pose)
+
+    def load(
+        self,
+        maps: Sequence[LandmarkMap],
+        pose: FloatArray | None,
+        covariance: FloatArray | None,
+        *,
+        is_at_start: bool,
+    ) -> None:
+        """Take maps, and the pose in them if it is given, or said by the settings at the start.
+
+        Else the landmarks that are known show it, or those that will be seen.
+        """
+        self.localiser.load(maps, self._settings.two_d_mode)
+        if pose is not None:
+            self.place(pose, covariance)
+        elif self._settings.set_initial_pose and is_at_start and not self.was_placed:
+            self._start_where_settings_say()
+        elif self.hypotheses.best.is_mapping:
+            if self.localiser.enter(self.hypotheses.best):
+                self.hypotheses.prune_to_best()
+        else:  # in a map that does not grow there is nothing to carry into another one
+            self.start(None)
+
+    def place(self, pose: FloatArray, covariance: FloatArray | None) -> None:
+        """Move the robot; if the pose in a loaded map was not known, it is now."""
+        self.was_placed = True
+        if self.localiser.is_localised:
+            self.hypotheses.prune_to_best().set_pose(self._allowed(pose), covariance)
+            self.localiser.doubt_pose()
+        else:
+            self.start(pose, covariance)
+
+    def doubt(self, pose: FloatArray, covariance: FloatArray | None) -> None:
+        """Search about the present pose if it is too rough to match points without ids by it."""
+        if covariance is not None and is_rough(covariance):
+            self.start(None)
+            self.localiser.search_near(pose, covariance)
+
+    def localise(self, event: ObservationEvent, outcome: Outcome) -> None:
+        """Look for the pose in a loaded map if it is not known, or not any more."""
+        localiser, hypotheses = self.localiser, self.hypotheses
+        missed = hypotheses.missed
+        reason = localiser.reason_to_reset(hypotheses.best, event, outcome, missed)
+        if reason is not None:
+            logger.warning('%s; localising again.', reason)
+            self.start(None)
+        if localiser.search(hypotheses.best):
+            hypotheses.prune_to_best()
+        elif (found := localiser.pose_by_tag(hypotheses.best)) is not None:
+            self.start(found.pose, found.covariance, found.known)
+            localiser.try_tag(found.tag_id)
+
+    def start(
+        self,
+        pose: FloatArray | None,
+        covariance: FloatArray | None = None,
+        known: LandmarkMap | None = None,
+    ) -> None:
+        """Start again with an empty map, or the loaded one, at ``pose`` (4, 4) if it is known.
+
+        ``known`` is the map that it is in; of several ones it is searched for if that is None.
+        """
+        rough = pose if known is None and len(self.localiser.maps) > 1 else None
+        pose = pose if rough is None else None
+        state = self._state_at(np.eye(4) if pose is None else self._allowed(pose))
+        self.hypotheses.reset(state)
+        self.localiser.start(state, pose is not None, covariance, known)
+        if rough is not None:
+            given = np.zeros((6, 6)) if covariance is None else covariance
+            self.localiser.search_near(rough, given + np.diag(GIVEN_POSE_STD**2))
+
+    def _start_where_settings_say(self) -> None:
+        settings = self._settings
+        turn = settings.initial_roll, settings.initial_pitch, settings.initial_yaw
+        deviations = settings.initial_angle_stddev, settings.initial_position_stddev
+        pose = se3.from_rpy((*settings.initial_position, *turn))
+        self.start(pose, np.diag(np.repeat(deviations, 3) ** 2))
+
+    def _state_at(self, pose: FloatArray) -> State:
+        """Return a state at its start, with P° = ``pose`` (4, 4)."""
+        state = State(make_gains(self._settings, pose), self._settings)
+        state.judges_innovations = self._judges_innovations
+        return state
+
+    def _allowed(self, pose: FloatArray) -> FloatArray:
+        """Return a pose (4, 4), or with ``two_d_mode`` what of it lies in the plane."""
+        return se3.flatten(pose) if self._settings.two_d_mode else pose

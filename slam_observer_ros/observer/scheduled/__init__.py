@@ -1,1 +1,0 @@
-"""Scheduled gains: the covariance of a small core, and landmarks that depend on it."""
