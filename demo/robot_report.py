@@ -45,17 +45,28 @@ class Interruption:
         """Note whether the robot is localised again: where it is, if it was carried."""
         if last.by_tf is None or not self.is_lost(last.time_s):
             return
-        off_m = np.linalg.norm(error_of(last.truth, last.by_tf)[:2])
-        if not self.is_carried or off_m < FOUND_M:
+        if self._is_found(last.truth, last.by_tf):
             self.localised_s = last.time_s
 
-    def back_after_s(self, seen: list[Seen], enough: int) -> float | None:
-        """Return how long after enough landmarks were in view it was localised; None if never."""
-        began_s, localised_s = self.began_s, self.localised_s
-        if began_s is None or localised_s is None:
+    def back_after_s(
+        self, seen: list[Seen], estimated: list[Estimated], enough: int
+    ) -> float | None:
+        """Return for how long it saw enough landmarks before it was localised; None if never.
+
+        That is by stamps of poses, which don't depend on how busy the machine is.
+        """
+        if self.began_s is None or self.localised_s is None:
             return None
+        began_s = self.began_s
+        after = (each for each in estimated if each.time_s > began_s)
+        found = (each.time_s for each in after if self._is_found(each.truth, each.pose))
+        found_s = next(found, self.localised_s)
         times = (s.time_s for s in seen if s.time_s > began_s and s.landmarks >= enough)
-        return max(0.0, localised_s - next(times, localised_s))
+        return max(0.0, found_s - next(times, found_s))
+
+    def _is_found(self, truth: FloatArray, pose: FloatArray) -> bool:
+        off_m = np.linalg.norm(error_of(truth, pose)[:2])
+        return not self.is_carried or bool(off_m < FOUND_M)
 
 
 def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console: Console) -> bool:
@@ -77,7 +88,7 @@ def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console
     position_m, heading_rad = _rms(errors[:, :2]), _rms(errors[:, 2:])
     sigma_m, sigma_rad, anees = _consistency(estimated)
     first_s = next(each.time_s for each in robot.seen if each.landmarks >= enough)
-    back_s = interruption.back_after_s(robot.seen, enough)
+    back_s = interruption.back_after_s(robot.seen, robot.estimated, enough)
     reached_hz = _rate_hz(robot.corrections_s)
     what = 'carried' if interruption.is_carried else 'restarted'
     console.print(
@@ -96,7 +107,7 @@ def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console
                 f'{what} at {interruption.planned_s:g} s': 'not localised again'
                 if back_s is None
                 else f'localised again {interruption.moved_s:.2f} s after it drove on, '
-                f'{back_s:.2f} s after the next {enough} {kind}',
+                f'by what it saw {back_s:.2f} s after the next {enough} {kind}',
             },
         )
     )

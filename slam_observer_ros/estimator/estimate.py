@@ -1,4 +1,4 @@
-"""What is estimated, to be read: pose, landmarks, velocity and their covariances."""
+"""Pose, landmarks and velocity as they are estimated, with their covariances, to be read."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from slam_observer_ros.state.state import State
 
 
 class Estimate:
-    """Pose and landmark map at ``stamp_ns``, that of the last event used.
+    """Pose and landmark map at ``stamp_ns``, the stamp of the last event used.
 
-    A velocity leads on from the last observation to there.
+    From the last observation on they follow the velocity.
     """
 
     _timeline: Timeline
@@ -83,7 +83,7 @@ class Estimate:
     def landmark_map(self) -> LandmarkMap:
         """The present map, as it can be saved and loaded: without landmarks that move.
 
-        Unless its frame is that of a loaded map, its covariances are those of its shape alone.
+        Unless it is in the frame of a loaded map, its covariances are of its shape alone.
         """
         state, loaded = self._state, self._localiser.loaded if self.is_localised else None
         landmark_map = map_of(state, loaded)
@@ -221,7 +221,7 @@ class Estimate:
 
     @property
     def motion_factors(self) -> list[MotionFactor]:
-        """How noisy turning and driving are over what is stated; empty where that is not known."""
+        """Noise of turning and driving over what is stated; empty where it is not known."""
         return self._state.motion_noise.factors.estimates
 
     def knows_motion_since(self, stamp_ns: int) -> bool:
@@ -231,8 +231,8 @@ class Estimate:
     def smooth(self) -> Smoothed:
         """Return the smoothed trajectory and map since the history began; the state is kept.
 
-        The history is that of the whole run with ``smoothing_window`` 0. Raise ParameterError if
-        none is kept, and SmoothingError if the observations don't determine everything.
+        With ``smoothing_window`` 0 that is the whole run. Raise ParameterError if no history is
+        kept, and SmoothingError if the observations don't determine everything.
         """
         return self._state.smooth()
 

@@ -58,7 +58,7 @@ class Placement:
     ) -> None:
         """Take maps, and the pose in them if it is given, or said by the settings at the start.
 
-        Else the landmarks that are known show it, or those that will be seen.
+        Otherwise the pose follows from landmarks that were seen, or that will be.
         """
         self.localiser.load(maps, self._settings.two_d_mode)
         if pose is not None:
@@ -133,5 +133,5 @@ class Placement:
         return state
 
     def _allowed(self, pose: FloatArray) -> FloatArray:
-        """Return a pose (4, 4), or with ``two_d_mode`` what of it lies in the plane."""
+        """Return a pose (4, 4), with ``two_d_mode`` its part in the plane."""
         return se3.flatten(pose) if self._settings.two_d_mode else pose

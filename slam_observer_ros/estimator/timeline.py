@@ -1,6 +1,6 @@
-"""The instant that an estimate is of, and the velocities that lead on from there.
+"""The instant of an estimate, and the velocities that lead on from there.
 
-A late observation is carried forward to it: what would be seen from where the state is now.
+A late observation is carried forward to that instant: to what would be seen from there.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from slam_observer_ros.state.matching import point_covariances
 from slam_observer_ros.state.state import State
 
 OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
-"""Called with velocities, and with the two stamps between which they lead, nanoseconds."""
+"""Called with velocities, and with the stamps of a motion along them: start and end, ns."""
 
 MAX_PENDING_VELOCITIES = 128
 """Velocities that may wait for an observation before the state is moved on without one."""
 
 
 class Moved(Protocol):
-    """What is moved along the velocities: hypotheses; ``best`` is the most likely one."""
+    """Hypotheses as the timeline moves them along the velocities."""
 
     @property
     def best(self) -> State:
@@ -59,17 +59,16 @@ class Timeline:
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
         self.stamp_ns: int | None = None  # of the last event used; None before the first
         self.state_ns: int | None = None  # of the hypotheses: velocities since are pending
-        # A delay, and beyond it half of what velocities are averaged over to estimate it.
+        # A delay, and half of the time over which velocities are averaged to estimate it.
         self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
         self._pending = 0
-        # Whether what was in force at the last event's stamp could not be changed any more.
-        self.was_late = False
-        self._in_force_ns = 0  # no velocity of before can change what is in force
+        self.was_late = False  # the last event came after its instant had been passed
+        self._in_force_ns = 0  # before this stamp velocities can't be changed any more
         self._newest_ns: dict[str, int] = {}
 
     def parts(self, velocities: VelocityBlock) -> Iterator[MeasuredVelocity]:
-        """Yield velocities as :meth:`append` takes them, each time those that are next."""
+        """Yield velocities in parts as :meth:`append` takes them."""
         if velocities.stamp_ns <= max(self.stamp_ns or -1, self._in_force_ns - 1):
             yield from velocities.events()
             return
@@ -79,7 +78,7 @@ class Timeline:
         yield velocities
 
     def _note_stamps(self, first_ns: int, last_ns: int) -> int:
-        """Note the stamps of what is about to be used; return ``state_ns``."""
+        """Note the stamps of an event that is about to be used; return ``state_ns``."""
         if self.stamp_ns is None or last_ns > self.stamp_ns:
             self.stamp_ns = last_ns
         if self.state_ns is None:
@@ -89,10 +88,10 @@ class Timeline:
     def append(self, measured: MeasuredVelocity) -> bool:
         """Add velocities; return whether they are in force: an angular one waits for a linear one.
 
-        A late one, which is no block, leads on from where velocities can still be changed. Raise
+        A single late one counts from the first stamp on where velocities can be changed. Raise
         :exc:`InvalidEventError` if a newer one of its kind was used before it (``'too_late'``).
         """
-        # Each kind in stamp order, and none before what is already in force.
+        # Each kind in stamp order, and none before velocities that can't be changed.
         first_ns = last_ns = measured.stamp_ns
         count = 1
         if isinstance(measured, VelocityBlock):
@@ -139,7 +138,7 @@ class Timeline:
             self._advance(self.stamp_ns)
 
     def _advance(self, stamp_ns: int) -> None:
-        """Move the hypotheses, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
+        """Move the hypotheses on from ``state_ns`` to ``stamp_ns``, never back."""
         self._pending = 0
         start_ns = self.state_ns
         if start_ns is None or stamp_ns <= start_ns:

@@ -112,7 +112,7 @@ static int is_stamp(i64 stamp_ns) { return -LATEST_NS < stamp_ns && stamp_ns < L
 typedef struct {
     const double *A, *y_ref;
     double *a, *P;
-    i64 N, first, is_planar;
+    i64 N, first, stride, is_planar;
     const double *rates;
     const i64 *estimated;
     const double *drift;
@@ -121,8 +121,8 @@ typedef struct {
 } Estimate;
 
 static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
-    static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "b", "d67", "lv",
-                                        "dcc", NULL};
+    static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "i", "b", "d67",
+                                        "lv", "dcc", NULL};
     if (!read_fields(door, tuple, specs, x, "Estimate"))
         return 0;
     x->p = x->is_planar ? 3 : 6;
@@ -133,7 +133,8 @@ static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
     x->c = (long)door->sizes['c'], x->c_v = (long)door->sizes['v'];
     door->sizes['p'] = x->p;
     if (x->room > MAX_ROOM || x->n > MAX_ROOM || x->c > MAX_ROOM || x->c_v > x->c
-        || x->first < x->p + x->c || x->first > x->room || x->N != x->first + x->k * x->n
+        || x->first < x->p + x->c || x->first > x->room || x->stride < x->k
+        || x->stride > MAX_ROOM || x->N != x->first + x->stride * x->n
         || x->N > x->room || !are_within(x->estimated, x->c_v, DELAY))
         return refuse("Estimate");
     door->sizes['f'] = (Py_ssize_t)x->first;
@@ -564,7 +565,7 @@ static void spread(const Estimate *x, const double *noise, const double *F, doub
         hat(y, K);
         for (int s = 0; s < turns; s++)
             for (int b = 0; b < x->k; b++)
-                J[s * N + first + x->k * i + b] = K[3 * b + x->pose + s];
+                J[s * N + first + x->stride * i + b] = K[3 * b + x->pose + s];
     }
     for (int s = 0; s < p; s++) {
         double *row = B + s * N;
@@ -1212,7 +1213,8 @@ static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
 static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Factors *factors,
                    const Observed *out) {
-    if (seen->m < 1 || seen->m > MAX_SEEN || x->c > 64 || !is_stamp(seen->stamp_ns))
+    if (seen->m < 1 || seen->m > MAX_SEEN || x->c > 64 || !is_stamp(seen->stamp_ns)
+        || x->stride != x->k)
         return UNUSUAL;
     Residuals res;
     size_t numbers = lay_out(&res, x, seen->m, NULL), M = (size_t)res.M;

@@ -11,7 +11,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 
 
 class Estimate(NamedTuple):
-    """X̂ and the covariance P of its errors (ε, c̃, ξ_1 … ξ_n), of a map of points at rest."""
+    """X̂ and the covariance P of its errors (ε, c̃, ξ_1 … ξ_n), of a map at rest."""
 
     A: FloatArray  # (4, 4) Â
     y_ref: FloatArray  # (n, 3) y_i° of the landmarks that P has
@@ -19,6 +19,7 @@ class Estimate(NamedTuple):
     P: FloatArray  # (room, room) of which the first N rows and columns count, changed in place
     size: int  # N
     first: int  # the first column of the landmarks; what is postponed is between p + c and it
+    stride: int  # columns of a landmark, those of its point first: more than k of a tag
     is_planar: bool  # whether p is 3 and k is 2, in place of 6 and 3
     rates: FloatArray  # (6, 7) [M b] of velocities M V + b
     estimated: IntArray  # (c_v,) which of these, row by row, c̃ begins with; 42 is the delay, last

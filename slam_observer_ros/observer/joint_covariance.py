@@ -71,9 +71,9 @@ class JointCovariance:
         return other
 
     @property
-    def is_of_points(self) -> bool:
-        """Whether nothing but positions is estimated of landmarks, and these are."""
-        return self._stride == self._axes.point
+    def is_at_rest(self) -> bool:
+        """Whether landmarks are estimated, but no velocities of theirs."""
+        return not self.chart.velocity
 
     @property
     def pose(self) -> FloatArray:

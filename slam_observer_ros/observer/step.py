@@ -2,10 +2,10 @@
 
 A motion along velocities without a gap, and an observation whose points are all of known
 landmarks, none of them in doubt. Anything else is UNUSUAL, and nothing is changed then: the
-filters' own methods go on from there. Points that are rejected, or of new landmarks, are left
-out by who calls it.
+filters' own methods go on from there, also where orientations of tags are seen. Points that are
+rejected, or of new landmarks, are left out by who calls it.
 
-The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω: see :mod:`.chart`.
+The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, and ω_i of tags: see :mod:`.chart`.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ def advance(
     P, of_c = x.P, slice(p, p + c)
     JT = np.zeros((p, len(P)))
     JT[:, :p] = np.eye(p)
-    JT[:, x.first : x.size] = -axes.turn_matrix(x.y_ref + x.a).reshape(-1, p).T
+    of_landmarks = JT[:, x.first : x.size].reshape(p, -1, x.stride)
+    of_landmarks[:, :, : axes.point] = -axes.turn_matrix(x.y_ref + x.a).transpose(2, 0, 1)
     half = (0.5 * (out.noise + F.dot(P[of_c, of_c]).dot(F.T))).dot(JT)
     if c:
         half += F.dot(P[of_c])
@@ -260,6 +261,8 @@ def observe(
 
     Without ``factors`` nothing is learnt of the noise of the motion.
     """
+    if x.stride != axes_of(x.is_planar).point:
+        return UNUSUAL
     residuals = _residuals(x, landmarks, seen, figures, limits, out)
     judged = None if residuals is None else _judged(x, residuals, limits)
     if residuals is None or judged is None:

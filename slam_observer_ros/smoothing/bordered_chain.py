@@ -46,19 +46,19 @@ class Equations(NamedTuple):
     poses: IntArray  # (M,) which pose saw …
     landmarks: IntArray  # (M,) … which landmark; no two are the same
     seen: FloatArray  # (M, d, k) blocks of B that link the two
-    first: FloatArray  # (d, b) what else links the first pose to the border
+    first: FloatArray  # (d, b) the prior's blocks, which link the first pose to the border
     corner: FloatArray  # (b, b) D
     gradient: FloatArray  # (S, d) g
     border_gradient: FloatArray  # (b,) h
 
 
 class Elimination(Protocol):
-    """What is left of the equations once the chain of poses is eliminated, T = Uᵀ U."""
+    """The equations of the border after the chain of poses is eliminated, T = Uᵀ U."""
 
     corner: FloatArray  # (b, b) D − Bᵀ T⁻¹ B
     border_gradient: FloatArray  # (b,) h − Bᵀ T⁻¹ g
     last_root: FloatArray  # (d, d) U⁻¹ of the last pose
-    last_rows: FloatArray  # (d, b) of U⁻ᵀ B those of the last pose
+    last_rows: FloatArray  # (d, b) rows of U⁻ᵀ B of the last pose
 
     def fill_in(self, border: FloatArray) -> FloatArray:
         """Return the changes (S, d) of the poses from those (b,) of the border."""
@@ -258,7 +258,7 @@ def landmark_columns(landmarks: IntArray, c: int, k: int) -> IntArray:
 
 
 def sum_by(labels: IntArray, count: int, values: FloatArray) -> FloatArray:
-    """Return the sums (count, …) of those of the ``values`` (M, …) that have the same label."""
+    """Return the sum of the ``values`` (M, …) of each label (count, …)."""
     M = len(labels)
     selection = csc_array((np.ones(M), labels, np.arange(M + 1)), (count, M))
     sums: FloatArray = selection @ values.reshape(M, math.prod(values.shape[1:]))

@@ -1,4 +1,4 @@
-"""What a filter has seen since its prior, kept so that it can be relinearised."""
+"""Motions and observations of a filter since its prior, kept to be relinearised."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _Motion: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class Keyframe(NamedTuple):
-    """All m landmarks of one observation, after the correction and with the new ones."""
+    """The m points of one observation after the correction, those of new landmarks included."""
 
     stamp_ns: int
     rows: IntArray  # (m,) which landmarks were seen
-    points: FloatArray  # (m, 3) where, metres, body frame
-    # (m, 3) from the sensor to where they should be, or are measured if that is not sure, metres
+    points: FloatArray  # (m, 3) where they were seen, metres, body frame
+    # (m, 3) from the sensor to where they should be, or to the points if that is not sure, metres
     lines_of_sight: FloatArray
     covariances: FloatArray | None  # (m, 3, 3) of the points, m²; None for the noise model's
     dt_s: FloatArray  # (m,) seconds since each was seen before; infinite if it was not
@@ -153,7 +153,7 @@ class History:
             self._start = self._end = pose.copy()
 
     def add(self, keyframe: Keyframe, pose: FloatArray, calibration: FloatArray) -> None:
-        """Append a keyframe, seen from ``pose`` (4, 4), with what is known of (c,) then."""
+        """Append a keyframe seen from ``pose`` (4, 4); ``calibration`` (c,) is as known then."""
         self.stamps_ns.append(keyframe.stamp_ns)
         self.poses.append(pose)
         self.calibrations.append(calibration)
@@ -164,7 +164,7 @@ class History:
         self._start = self._slip = self._motion = None
 
     def add_calibration(self, values: FloatArray, variances: FloatArray) -> None:
-        """Append what is estimated of a calibration (c,) from now on; nothing was seen of it."""
+        """Append entries (c,) of a calibration that are estimated from now on."""
         self._summarised = [part.with_calibration(values) for part in self._summarised]
         self._latest = self._gathered().with_calibration(values)
         self._none = self._none.with_calibration(values)

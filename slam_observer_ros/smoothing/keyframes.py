@@ -1,4 +1,4 @@
-"""What is smoothed, as arrays: keyframes, the motions between them, and estimates of all."""
+"""Arrays for smoothing: keyframes, the motions between them, and estimates of all."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 
 @dataclass(frozen=True, slots=True)
 class SeenTurns:
-    """How T tags are turned that are among M observed points."""
+    """Orientations of T tags among M observed points."""
 
-    points: IntArray  # (T,) which of these
+    points: IntArray  # (T,) which of the points are tags
     Z: FloatArray  # (T, 3, 3) from the tag's own axes to the body's
     flipped: FloatArray  # (T, 3, 3) the other orientation that looks nearly the same
     information: FloatArray  # (T, q, q) inverse covariance of it, along the body's axes, 1/rad²
 
     def only(self, kept: BoolArray) -> SeenTurns:
-        """Return those of some of the points (M,), numbered without the others."""
+        """Return the tags among some of the points (M,), numbered without the others."""
         turns = self.without(~kept)
         return replace(turns, points=(np.cumsum(kept) - 1)[turns.points])
 
     def without(self, forgotten: BoolArray) -> SeenTurns:
-        """Return what is left if some of the points (M,) show no orientation."""
+        """Return the tags without those among the ``forgotten`` points (M,)."""
         left = ~forgotten[self.points]
         return SeenTurns(*(getattr(self, field.name)[left] for field in fields(self)))
 
@@ -73,7 +73,7 @@ class Keyframes:
     information: FloatArray  # (M, k, k) inverse covariance of it, body frame, 1/m²
     # (M,) how much of it counts: less than 1 where its error is partly that of a point before
     shares: FloatArray
-    turns: SeenTurns  # of those that are tags, where orientations are estimated
+    turns: SeenTurns  # of the tags among them, where orientations are estimated
     sensed: Sensed | None = None  # (M,) as the sensors showed them, where these are calibrated
 
     def with_slips(self, are_slips: BoolArray | None = None) -> Keyframes:

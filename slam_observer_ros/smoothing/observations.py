@@ -28,7 +28,7 @@ NO_SENSORS = None, None, None, np.empty((0, 7)), np.empty((0, 7), dtype=np.int64
 
 
 class SensedPoints:
-    """M points; the last ``count`` entries c_s of the calibration are those of their sensors.
+    """M points; the last ``count`` entries c_s of the calibration belong to their sensors.
 
     ``stated`` (s, 7) has the values of s sensors, and ``columns`` (s, 7) where in the calibration
     (c,) those are that are estimated, −1 for others.
@@ -102,10 +102,10 @@ class Observations:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the equations (M, q, q) and their gradients (M, q), with Huber's weights.
 
-        q unknowns are those of the chain's pose, the last ``chained`` of which are a calibration,
-        and of the landmark: its position, then its turn if that is estimated; without a chained
-        calibration then those of sensors. If ``gated``, what a filter would reject at the
-        solution has less weight.
+        The q unknowns are the pose in the chain, whose last ``chained`` ones are a calibration,
+        and the landmark: its position, then its turn if that is estimated. Without a chained
+        calibration sensors follow. If ``gated``, points that a filter would reject at the solution
+        have less weight.
         """
         keyframes, k = self._keyframes, self._axes.point
         R, predicted, error = self._of_points(solution)

@@ -1,4 +1,4 @@
-"""What was known at one instant of the pose, the calibration and the landmarks."""
+"""Pose, calibration and landmarks as they were known at one instant."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ANYWHERE_M = 1e3
 """Standard deviation of an unknown landmark, metres."""
 
 EXACT_M = 1e-6
-"""Standard deviation of what is said to be exact, metres."""
+"""Standard deviation of a position that is said to be exact, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +32,10 @@ class Prior:
     pose: FloatArray  # (4, 4) P
     calibration: FloatArray  # (c,)
     points: FloatArray  # (n, 3) landmarks that were known, metres; the first n of the map
-    orientations: FloatArray  # (n, 3, 3) of these, zero where that is not known, or estimated
+    orientations: FloatArray  # (n, 3, 3) of these, zero where unknown or not estimated
     covariance: FloatArray  # (d + c + k n, d + c + k n) of (η, dc, dp)
-    # Whether it is that of (η, dc, dy) instead, of y_i = P⁻¹ p_i as seen from the pose; then
-    # orientations are as seen from there, too.
+    # Whether the covariance is of (η, dc, dy) instead, with y_i = P⁻¹ p_i as seen from the pose;
+    # then orientations are as seen from there, too.
     is_relative: bool = False
 
     def relative(self, axes: EstimatedAxes) -> Prior:
@@ -54,10 +54,11 @@ class Prior:
     def least_nonlinear(self, axes: EstimatedAxes) -> tuple[Prior, float]:
         """Return the prior in the coordinates, world's or body's, that heading changes least.
 
-        And the standard deviation, rad, of the angle by which it may yet turn in these. A map that
-        the robot has made may turn as a whole, and the pose with it, by more than one against the
-        other: in world coordinates that is an error of second order in the angle. In a loaded map
-        the pose alone may turn. After a blind stretch either may turn far.
+        Return the standard deviation, rad, of the angle by which it may yet turn in these, too. A
+        map that the robot has made may turn as a whole and together with the pose, further than
+        one may turn against the other: in world coordinates that is an error of second order in
+        the angle. In a loaded map the pose alone may turn. After a blind stretch either may turn
+        far.
         """
         turns = self._turns(axes)
         together = self._turned_together(axes)
@@ -200,13 +201,13 @@ class Prior:
         return len(self.covariance) - self._unknowns(axes) * len(self.points)
 
     def _known(self, axes: EstimatedAxes, rows: IntArray) -> tuple[IntArray, IntArray]:
-        """Return those of landmarks (m,) that were known, and their columns."""
+        """Return which of the landmarks (m,) were known, and their columns."""
         known, k = rows[rows < len(self.points)], self._unknowns(axes)
         return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()
 
 
 def inverse(covariances: FloatArray) -> FloatArray:
-    """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
+    """Return inverses of covariances (…, d, d); an exact position counts as known to EXACT_M."""
     known = covariances + EXACT_M**2 * np.eye(covariances.shape[-1])
     if known.ndim == 2:
         return definite_inverse(known)

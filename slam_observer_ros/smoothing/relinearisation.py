@@ -1,18 +1,18 @@
-"""When what was seen is relinearised, and what the filter takes over from that.
+"""When observations are relinearised, and what the filter takes over from that.
 
-Covariances that were computed around a poor early estimate stay wrong, so after a long blind
-stretch a plain filter closes its loop badly. How much its linearisation can have lost shows in
-how far its corrections have turned the robot.
+A covariance that was computed around a poor early estimate stays wrong, so after a long blind
+stretch a plain filter closes its loop badly. The corrections since show how much may be wrong: by
+how far they have turned the robot.
 
-What was relinearised stays as it is: from then on a summary stands for it, in coordinates in
-which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a blind stretch
-there may be no such summary until landmarks seen before are seen again. Else the cost does not
-grow with the history; only :meth:`Relinearisation.smooth` needs all of it.
+Relinearised observations are not relinearised again. A summary stands for them from then on, in
+coordinates in which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a
+blind stretch there may be no such summary until known landmarks are seen again. Otherwise the cost
+does not grow with the history; only :meth:`Relinearisation.smooth` needs all of it.
 
-It is O(n³) for n landmarks. In a map without a dense covariance (:class:`.CompressedCovariance`)
-nothing is relinearised any more. Its history goes on, to be smoothed, until it would have to begin
-again: then it is given up. Among tags the covariance stays dense, but from
-:data:`MAX_UNKNOWNS` on nothing is relinearised, either.
+The cost is O(n³) for n landmarks. A map without a dense covariance
+(:class:`.CompressedCovariance`) is not relinearised any more. Its history goes on, for smoothing,
+until it would have to begin again: then it is given up. Among tags the covariance stays dense, but
+from :data:`MAX_UNKNOWNS` on they are not relinearised, either.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from slam_observer_ros.smoothing.slips import confirmed_slips
 logger = logging.getLogger(__name__)
 
 SHARE_OF_HISTORY = 0.1
-"""Share of all observations so far that are relinearised at least, up to ``MAX_INTERVAL``.
+"""Share of all observations so far that are relinearised at once at least, up to ``MAX_INTERVAL``.
 
-As large maps take many observations, the O(n³) that this costs for n landmarks is shared by so
-many that each of them costs no more than an update, O(n²).
+A large map takes many observations. So many share the cost, O(n³) for n landmarks, that each of
+them costs no more than an update, O(n²).
 """
 
 MAX_INTERVAL = 300
@@ -65,7 +65,7 @@ MAX_TURN_RAD = 0.2
 
 EARLY_SHARE = 0.1
 """Share of the observations otherwise waited for that will do after a single large correction:
-what is linearised before the next time is linearised at the wrong estimate.
+until then observations are linearised at the wrong estimate.
 """
 
 ITERATIONS, TOLERANCE = 2, 2e-2
@@ -79,7 +79,7 @@ SLIP_TOLERANCE = 1e-4
 
 
 class KnownErrors(Protocol):
-    """What there must be of :class:`.Errors`; P may become one for large maps."""
+    """The part of :class:`.Errors` that is needed; P may become one for large maps."""
 
     observer: Observer
     joint: JointCovariance
@@ -108,7 +108,7 @@ class Past:
         return self
 
     def reset(self, since: str) -> None:
-        """Forget all but what is known now; ``since`` is why, in words."""
+        """Begin a new history with the present estimate; ``since`` says why, in words."""
 
     def move(self, motion: Motion) -> None:
         """Note a motion of the robot."""
@@ -154,11 +154,11 @@ class Past:
 
 
 class Relinearisation(Past):
-    """What a filter has seen since a prior, and when that is relinearised.
+    """Keeps the ``history`` of a filter since a prior, and relinearises it when it is due.
 
     Relinearising changes the observer and the covariance of ``errors``, and the ``calibration``.
     ``relinearization_*``, ``smoothing_window``, ``huber_threshold``, ``rejection_threshold`` and
-    the noise of observations are read from the settings. ``history`` has what was seen.
+    the noise of observations are read from the settings.
     """
 
     def __init__(self, errors: KnownErrors, calibration: Calibration, settings: Settings) -> None:
@@ -184,7 +184,7 @@ class Relinearisation(Past):
         return self._settings.relinearization_interval > 0 and not self._is_given_up
 
     def reset(self, since: str) -> None:
-        """Forget all but what is known now; ``since`` is why, in words."""
+        """Begin a new history with the present estimate; ``since`` says why, in words."""
         self._is_given_up = not self._is_dense
         self._start(self._known(), since)
 
@@ -193,7 +193,7 @@ class Relinearisation(Past):
         if not self.is_active:
             return
         if self._observer.have_moved and self._observer.u.any():
-            # How far they went depends on how the robot was turned, which no smoother here knows.
+            # Their ways depend on how the robot was turned, which the smoother does not consider.
             self.reset('a landmark came with a velocity')
         else:
             self.history.move(motion)
@@ -221,12 +221,13 @@ class Relinearisation(Past):
         self._largest_turn = max(self._largest_turn, turn_rad)
 
     def add(self, keyframe: Keyframe, in_doubt: bool) -> None:
-        """Add a keyframe; if it is time, or a landmark ``in_doubt``, relinearise the latest ones.
+        """Add a keyframe; relinearise the latest ones if it is time.
 
-        The smoother's marginal becomes the filter's covariance, and its solution the observer's
-        new reference ξ°, with â_i = 0. It sums up all that was seen, for the next time.
+        Or if ``in_doubt``: some of its landmarks may have moved. The smoother's marginal becomes
+        the filter's covariance, and its solution the observer's new reference ξ°, with â_i = 0.
+        This is the summary for the next time.
         """
-        if not len(keyframe.rows):  # says nothing: the motions before and after it add up
+        if not len(keyframe.rows):  # empty: the motions before and after it add up
             return
         self.history.add(keyframe, self._observer.A.copy(), self._calibration.values)
         self._seen += 1
@@ -242,7 +243,7 @@ class Relinearisation(Past):
             self._sum_up(self._relinearise())
 
     def add_calibration(self) -> None:
-        """Note what is estimated of the calibration from now on, beside what was so far."""
+        """Note entries of the calibration that are estimated from now on."""
         known = len(self.history.calibrations[-1])
         values, variances = self._calibration.values, self._calibration.initial_variances
         if len(values) > known:
@@ -263,8 +264,7 @@ class Relinearisation(Past):
     def merge(self, rows: IntArray, copies: IntArray) -> None:
         """Take landmarks ``copies`` (m,) for ``rows`` (m,), as the filter has done.
 
-        What was summed up of both would have to be merged, too: what the filter knows now stands
-        for it, and for what was seen since.
+        A summary that has both can't be merged: the filter's present estimate becomes the summary.
         """
         were_summed_up = np.min(copies) < len(self.history.summary.points)
         self.history.merge(rows, copies)
@@ -352,7 +352,7 @@ class Relinearisation(Past):
         return turned_far and self._observations >= least
 
     def _sum_up(self, is_done: bool) -> None:
-        """Let what is known now stand for all keyframes, if they could be relinearised."""
+        """Let the present estimate be the summary of all keyframes, if they were relinearised."""
         self._clear_counts()
         if not (is_done or self._window_is_full):
             return
@@ -388,7 +388,7 @@ class Relinearisation(Past):
     def _take_over(self, step: Step, covariance: FloatArray) -> None:
         """Take the last step's start for the reference; the step is a correction from there.
 
-        ``covariance`` belongs to that start. Taken for that of the step's end it would say
+        The ``covariance`` belongs to that start. At the step's end it would seem to know
         something of the gauge, which is unknown.
         """
         start, end, observer = step.start, step.end, self._observer
@@ -414,8 +414,8 @@ class Relinearisation(Past):
         """Return where iterations begin among tags, given the present estimates."""
         if not self._axes.turn:
             return start
-        # The poses are those of their time, the map is that of now: after a loop was closed much
-        # of what was seen from them is far off, and would be taken for outliers.
+        # The poses are as estimated at their time, the map as estimated now: after a loop was
+        # closed many points seen from these poses are far off, and would be taken for outliers.
         return smoother.ungated(start)
 
     def _solution_from(self, first: int) -> Solution:
@@ -428,7 +428,7 @@ class Relinearisation(Past):
         return Solution(poses, calibrations, observer.points, observer.orientations.B.copy())
 
     def _known(self) -> Prior:
-        """Return what is known now."""
+        """Return the present estimate as a prior."""
         observer, joint = self._observer, self._joint
         points = observer.points[:0] if self._is_given_up else observer.points
         P = joint.of_robot if self._is_given_up else joint.of_positions(points)

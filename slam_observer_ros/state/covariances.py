@@ -1,6 +1,6 @@
 """Covariances as users know them, in the world or as seen from the robot.
 
-They are made of those of the error ε of Â = exp(ε) A and the errors ã_i of the landmarks, in the
+They follow from covariances of the error ε of Â = exp(ε) A and the errors ã_i of landmarks, in the
 reference frame.
 
 Seen from the robot these errors are half turned: with the attitude error w = ε_Ω and
@@ -26,7 +26,7 @@ MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
 
 
 def of_landmarks(observer: Observer, covariances: FloatArray) -> FloatArray:
-    """Return those of landmarks along the world's axes, given ``covariances`` of ã_i (n, 3, 3)."""
+    """Return covariances of landmarks along the world's axes, given those of ã_i (n, 3, 3)."""
     R = observer.reference_pose[:3, :3]
     world: FloatArray = R @ covariances @ R.T
     return world

@@ -31,11 +31,11 @@ SAME_POSITION = 4.0
 class MatchedObservation:
     """An observation, with the landmarks of a state that its points are of."""
 
-    event: ObservationEvent  # where nothing is added to the map, without what is not in it
-    rows: IntArray  # (m,) row of the landmark that each point is, −1 where it is new
+    event: ObservationEvent  # where mapping is over, without points of unknown landmarks
+    rows: IntArray  # (m,) row of each point's landmark, −1 where it is new
     covariances: FloatArray  # (m, 3, 3) of the points, body frame, m²
-    known: ObservationEvent  # the part of it whose landmarks are not new
-    residuals: Residuals  # of that part
+    known: ObservationEvent  # the points of known landmarks …
+    residuals: Residuals  # … and theirs
     left_out: int  # points of the observation that are not in ``event``
 
 
@@ -58,7 +58,7 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
 
 
 def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
-    """Return an observation as it is by the calibration of its sensor, unless it is already."""
+    """Return an observation corrected by the calibration of its sensor, if it is not yet."""
     calibration = state.calibration
     if not calibration.corrects_points or event.sensed is not None:
         return event
@@ -68,7 +68,7 @@ def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
 
 
 def corrected_again(state: State, event: ObservationEvent) -> ObservationEvent:
-    """Return an observation as it is by what a correction has made of the calibration."""
+    """Return an observation by the present calibration, which a correction has changed."""
     return sensing.corrected_again(state.calibration, event)
 
 
@@ -85,7 +85,7 @@ def sensitivity(
 
 
 def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
-    """Return the part of an observation that is of known landmarks, and their rows."""
+    """Return the points of known landmarks in an observation, and their rows."""
     rows = state.landmarks.rows_of(event.ids)
     is_known = rows >= 0
     return event.select(is_known), rows[is_known]
@@ -120,7 +120,7 @@ def keyframe_of(
     rows: IntArray,
     orientations: SeenOrientations | None = None,
 ) -> Keyframe:
-    """Return what is needed to linearise an observation again, after its correction."""
+    """Return an observation, after its correction, as it is kept to be linearised again."""
     lines_of_sight, noise = _lines_of_sight(state, event, rows), state.observation_noise
     is_stated = event.covariances is not None
     stated = noise.covariances(event, lines_of_sight) if is_stated else None
@@ -163,9 +163,10 @@ def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> 
 
 
 def rejected_before(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
-    """Return which known landmarks (m,) in it were rejected before where they are seen now.
+    """Return which known landmarks (m,) were rejected before where they are seen now.
 
-    And how far (m, 3) all of them are from their last rejected position, metres, reference frame.
+    Return how far (m, 3) all of them are from where they were rejected last, too: metres,
+    reference frame.
     """
     rows = matched.residuals.rows
     points, tolerances_m = positions(state, matched.known)
@@ -183,7 +184,7 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     landmarks, settings = state.landmarks, state.settings
     if not len(landmarks):
         return event.lines_of_sight
-    # A landmark that is new, in doubt, or may itself be an outlier is where it was measured.
+    # A new or doubtful landmark, and one that may be an outlier, is where it was measured.
     is_confirmed = landmarks.counts.take(rows, mode='wrap') >= settings.confirmations
     in_doubt = landmarks.in_doubt(rows, settings.max_rejections)
     is_sure = (rows >= 0) & is_confirmed & ~in_doubt
@@ -199,7 +200,7 @@ class Expected:
 
     r: FloatArray  # (m, k)
     distances: FloatArray  # (m,) Mahalanobis distance of each
-    R: FloatArray  # (m, k, k) what of their covariance is that of the points, m²
+    R: FloatArray  # (m, k, k) the part of their covariance that comes from the points, m²
     S: FloatArray  # (m k, m k) their joint covariance, m²; empty if it is not known
 
     @classmethod

@@ -79,7 +79,7 @@ def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> No
 
 
 def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Relinearise, if it is time; relocate landmarks in doubt that this does not explain."""
+    """Relinearise, if it is time; relocate doubtful landmarks that this does not explain."""
     # After the correction it is known better where they were seen.
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     some_are = bool(np.count_nonzero(in_doubt))
@@ -99,7 +99,7 @@ def _drop_history_if_full(state: State, matched: MatchedObservation) -> None:
 
 
 def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEvent, IntArray]:
-    """Add new landmarks; return the part of the observation that is mapped now, and its rows."""
+    """Add new landmarks; return the points of landmarks in the map by now, and their rows."""
     event, rows = matched.event, matched.rows
     if len(matched.known.ids) == len(rows):
         return event, rows
@@ -110,7 +110,7 @@ def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEven
 
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Relocate landmarks in doubt that are still far off; return ids of those that have moved."""
+    """Relocate doubtful landmarks that are still far off; return ids of landmarks that moved."""
     event = corrected_again(state, event)
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
@@ -140,7 +140,7 @@ def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> No
 def disbelieve(state: State, event: ObservationEvent) -> None:
     """Count points as rejected although the gate lets them pass.
 
-    Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
+    Landmarks that become doubtful by that are forgotten, and are new when they are seen next.
     """
     event, rows = mapped(state, event)  # one may have made room
     state.landmarks.reject(rows, *positions(state, event))
@@ -190,10 +190,10 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
 
 
 def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray) -> None:
-    """Take over orientations of landmarks ``rows`` (m,) of which none is known, or a wrong one.
+    """Take over orientations of landmarks ``rows`` (m,) that have none yet, or a wrong one.
 
-    One is wrong that was rejected more often than it was seen, or ``max_rejections`` times, all
-    in a row.
+    An orientation is wrong if it was rejected, all in a row, more often than it was seen, or
+    ``max_rejections`` times.
     """
     gains, tags, Z = state.gains.tags, state.observer.orientations, event.orientations
     if gains is None or Z is None or state.observer.is_exact:
@@ -220,7 +220,7 @@ def seen_orientations(
     seen = _all_seen(state, event, rows, event.orientations)
     if event.sensed is None or event.sensed.orientations is None:
         return seen
-    # As the sensor showed them: what is known of it will have changed.
+    # As the sensor showed them: its calibration will have changed by then.
     Z = event.sensed.orientations
     return replace(seen, Z=Z, flipped=flipped(Z, event.sensed.arms))
 
@@ -241,7 +241,7 @@ def flipped(Z: FloatArray, lines_of_sight: FloatArray) -> FloatArray:
 def _seen(
     state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray, are_wanted: BoolArray
 ) -> SeenOrientations:
-    """Return those of the orientations in an observation that are wanted (m,) and known."""
+    """Return the wanted (m,) orientations in an observation, where it has one."""
     return _all_seen(state, event, rows, Z).select(are_wanted & Z.any(axis=(1, 2)))
 
 
@@ -258,9 +258,9 @@ def _all_seen(
 
 
 def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:
-    """Return the orientations (m, 3, 3) that should be seen; those that are, where none is known.
+    """Return the orientations (m, 3, 3) expected of tags; of an unknown one, as it is seen.
 
-    By that which is seen a tag that seems to be tilted would be trusted more than a frontal one.
+    By the seen orientation, a tag that only seems to be tilted would be trusted too much.
     """
     tags = state.observer.orientations
     expected: FloatArray = state.observer.A[:3, :3].T @ tags.B[rows]

@@ -28,6 +28,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Observed,
     Seen,
 )
+from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.robust import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.motion_noise import Factors
@@ -59,13 +60,14 @@ def advance(
     state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
 ) -> FloatArray | None:
     """Move a state on between two stamps (27); return the variances (6,) of the motion by axis."""
-    if not _is_of_points(state):
+    joint = _at_rest(state)
+    if joint is None:
         return None
-    x = _estimate(state)
+    x = _estimate(state, joint)
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    state.known_errors.joint.note_motion()
+    joint.note_motion()
     duration_s = to_s(end_ns - start_ns)
     state.relinearisation.move_on(x.A, out.A, out.noise, out.sensitivity, duration_s)
     of_driving = out.noise - out.of_turning
@@ -110,7 +112,7 @@ def _led_to(
     # Landmarks have no part in it.
     now = errors.joint.of_robot
     P, p, figures = now.copy(), axes.p, state.motion_noise.figures
-    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, len(P), len(P))
+    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, (len(P), len(P), errors.joint.chart.stride))
     A, covariances = np.empty((len(ends_ns), 4, 4)), np.zeros((len(ends_ns), 6, 6))
     out = _room_for_motion(state)
     for row, (known, end_ns) in enumerate(zip(velocities, ends_ns, strict=True)):
@@ -159,13 +161,14 @@ def takes(state: State, event: ObservationEvent) -> bool:
 
     Made at the state's instant, by a sensor that is known.
     """
-    calibration = state.calibration
+    calibration, joint = state.calibration, _at_rest(state)
     return (
         event.velocities is None
         and event.orientations is None
         and event.sensed is None  # late, and carried forward
         and not (calibration.corrects_points and event.sensor_frame not in calibration.sensors)
-        and _is_of_points(state)
+        and joint is not None
+        and joint.chart.stride == state.axes.point
     )
 
 
@@ -185,7 +188,7 @@ def correct(
     if not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
         return None
     joint.activate(rows)
-    x, places = _estimate(state), joint.places(rows)
+    x, places = _estimate(state, joint), joint.places(rows)
     seen = _seen(state, event, places)
     settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
     factors = noise.flat() if of_all is None else None
@@ -230,28 +233,28 @@ def correct(
     return Corrected(status, rows, seen, out, factors)
 
 
-def _is_of_points(state: State) -> bool:
-    """Return whether what is known is P of a map of points at rest, and no more of them."""
+def _at_rest(state: State) -> JointCovariance | None:
+    """Return P, where landmarks are estimated, and are at rest."""
     errors = state.errors
-    return errors is not None and errors.joint.is_of_points and not state.observer.have_moved
+    if errors is None or not errors.joint.is_at_rest or state.observer.have_moved:
+        return None
+    return errors.joint
 
 
-def _estimate(state: State) -> Estimate:
-    """Return what is estimated, of a map of points at rest, as plain arrays."""
-    joint, observer = state.known_errors.joint, state.observer
-    matrix, active = joint._matrix, joint.active
+def _estimate(state: State, joint: JointCovariance) -> Estimate:
+    """Return what is estimated as plain arrays, of landmarks :func:`_at_rest`."""
+    observer, matrix, active = state.observer, joint._matrix, joint.active
     return _estimate_of(
         state,
         observer.y_ref[active],
         observer.a[active],
         matrix._storage,
-        matrix._size,
-        joint.first,
+        (matrix._size, joint.first, joint.chart.stride),
     )
 
 
 def _estimate_of(
-    state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, size: int, first: int
+    state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, sizes: tuple[int, int, int]
 ) -> Estimate:
     calibration = state.calibration
     return Estimate(
@@ -259,8 +262,7 @@ def _estimate_of(
         y_ref,
         a,
         P,
-        size,
-        first,
+        *sizes,
         state.settings.two_d_mode,
         calibration.rates,
         calibration.velocity_places,

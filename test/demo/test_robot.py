@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import hall
-from hall_robot import Seen
+from hall_robot import Estimated, Seen
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -87,11 +87,12 @@ def test_wheels_drift_from_the_truth():
 def test_the_time_to_be_localised_again_counts_from_the_tags():
     sight = [hall_seen(10.5, 1), hall_seen(11.0, 2), hall_seen(12.0, 2)]
 
-    def back_after_s(localised_s):
-        return Interruption(10.0, False, 10.0, localised_s).back_after_s(sight, 2)
+    def back_after_s(localised_s, *stamps_s):
+        poses = [Estimated(time_s, np.eye(4), np.eye(4), np.eye(6)) for time_s in (9.9, *stamps_s)]
+        return Interruption(10.0, False, 10.0, localised_s).back_after_s(sight, poses, 2)
 
-    assert back_after_s(11.4) == pytest.approx(0.4)
-    assert back_after_s(10.2) == 0.0
+    assert back_after_s(13.0, 11.4, 11.6) == pytest.approx(0.4), 'however late it was heard of'
+    assert back_after_s(10.4, 10.2) == 0.0
     assert back_after_s(None) is None
 
 

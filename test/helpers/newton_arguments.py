@@ -25,14 +25,13 @@ def random_equations(S, landmarks):
     rng, b = np.random.default_rng(S), C + K * landmarks
     poses = np.repeat(np.arange(S), SEEN)
     seen_landmarks = (poses + rng.integers(0, landmarks, len(poses))) % landmarks
-    A = np.zeros((0, S * D + b))
+    measured = []
 
     def measure(rows, *columns):
-        nonlocal A
-        J = np.zeros((rows, A.shape[1]))
+        J = np.zeros((rows, S * D + b))
         places = np.concatenate(columns)
         J[:, places] = rng.normal(size=(rows, len(places)))
-        A = np.concatenate([A, J])
+        measured.append(J)
 
     border = S * D + np.arange(b)
     measure(D + b, np.arange(D), border)
@@ -40,6 +39,7 @@ def random_equations(S, landmarks):
         measure(D, np.arange(s * D, (s + 2) * D), border[:C])
     for s, i in zip(poses, seen_landmarks, strict=True):
         measure(K, np.arange(s * D, (s + 1) * D), border[C + K * i :][:K])
+    A = np.concatenate(measured)
     H, g = A.T @ A, A.T @ rng.normal(size=len(A))
     blocks = H[: S * D, : S * D].reshape(S, D, S, D)
     B = H[: S * D, S * D :].reshape(S, D, b)

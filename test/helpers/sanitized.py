@@ -31,7 +31,7 @@ def refused(source, arguments, folder):
         pytest.skip('gcc has no address sanitizer here')
     name = source.stem
     library = folder / f'{name}{importlib.machinery.EXTENSION_SUFFIXES[0]}'
-    flags = ['-O1', '-g', '-fPIC', '-shared', '-DSOURCES=0', '-fsanitize=address,undefined']
+    flags = ['-O0', '-g', '-fPIC', '-shared', '-DSOURCES=0', '-fsanitize=address,undefined']
     flags += ['-fno-sanitize-recover=all']
     subprocess.run(
         [compiler, *flags, f'-I{include}', str(source), '-o', str(library), '-lm'], check=True

@@ -27,7 +27,7 @@ def random_covariance(rng, size, scale=0.1):
     return scale**2 * M @ M.T / size
 
 
-def random_estimate(rng, n=None):
+def random_estimate(rng, n=None, of_tags=False):
     is_planar = bool(rng.integers(2))
     p, k = (3, 2) if is_planar else (6, 3)
     velocity_entries = rng.permutation(42)[: rng.integers(1, 7)]
@@ -35,7 +35,8 @@ def random_estimate(rng, n=None):
     c = len(estimated) + int(rng.integers(0, 4))
     n = int(rng.integers(1, 40)) if n is None else n
     first = p + c + int(rng.integers(0, 9)) * int(rng.integers(2))  # with what is postponed
-    size = first + k * n
+    stride = k + of_tags * (p - k)
+    size = first + stride * n
     room = size + int(rng.integers(0, 9))
     P = np.zeros((room, room))
     P[:size, :size] = random_covariance(rng, size)
@@ -46,12 +47,12 @@ def random_estimate(rng, n=None):
         A = se3.flatten(A)
         y_ref[:, 2] = a[:, 2] = 0.0
     drift = np.diag(rng.uniform(0.0, 1e-6, c)) * rng.integers(2)
-    return Estimate(A, y_ref, a, P, size, first, is_planar, rates, estimated, drift)
+    return Estimate(A, y_ref, a, P, size, first, stride, is_planar, rates, estimated, drift)
 
 
 def random_motion(rng):
     """Return arguments of ``advance``."""
-    x = random_estimate(rng, None if rng.random() < 0.9 else 0)
+    x = random_estimate(rng, None if rng.random() < 0.9 else 0, rng.random() < 0.3)
     r = int(rng.integers(2, 30))
     steps_ns = rng.integers(1_000_000, 100_000_000, r)
     stamps_ns = START_NS + np.cumsum(steps_ns)
@@ -86,7 +87,7 @@ def random_motion(rng):
 
 def random_observation(rng):
     """Return arguments of ``observe``."""
-    x = random_estimate(rng)
+    x = random_estimate(rng, of_tags=rng.random() < 0.03)
     n, p, k = len(x.a), 3 if x.is_planar else 6, 2 if x.is_planar else 3
     m = int(rng.integers(1, min(n, 8) + 1))
     rows = rng.permutation(n)[:m]
@@ -131,7 +132,7 @@ def random_observation(rng):
         np.zeros(int(rng.choice([0, m * (m + 1) * k * k]))),
     )
     figures = PointFigures(*rng.uniform(1e-4, 1e-2, 5).tolist())
-    assert x.size == x.first + k * n
+    assert x.size == x.first + x.stride * n
     return x, landmarks, seen, figures, limits, factors, out
 
 

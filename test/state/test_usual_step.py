@@ -14,9 +14,11 @@ from slam_observer_ros.association.costs import pairing_cost
 from slam_observer_ros.association.interpretations import as_its_ids_say
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import core
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import match
 from slam_observer_ros.state.step import step
@@ -201,6 +203,33 @@ def test_so_it_is_where_few_landmarks_of_a_large_map_are_active(worlds, monkeypa
     assert both.used[usual] >= USUAL_SHARE * both.observed
     assert both.entered >= 5
     assert both.moved >= USUAL_SHARE * both.observed
+
+
+@pytest.mark.parametrize('is_planar', [False, True])
+@pytest.mark.parametrize('is_large', [False, True])
+def test_among_tags_with_orientations_motions_are_usual(monkeypatch, is_planar, is_large):
+    if is_large:
+        monkeypatch.setattr(RiccatiGains, 'block', BlockSize(8, 10, kept=4, kept_per_seen=1))
+    both, rng = BothWays(monkeypatch), np.random.default_rng(0)
+    settings = Settings(use_tag_orientation=True, two_d_mode=is_planar, reorder_window=0.0)
+    estimator = Estimator(settings, judges_innovations=True)
+    V = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0])
+    tags = rng.uniform(-8.0, 8.0, (24, 3)) * (1.0, 1.0, 1.0 - is_planar)
+    for step_number in range(60):
+        stamp_ns, pose = step_number * 10**8, se3.exp(0.1 * step_number * V)
+        noisy = V + 0.02 * rng.standard_normal(6)
+        estimator.add(VelocityEvent(stamp_ns, noisy))
+        seen = se3.transform(se3.inverse(pose), tags)
+        ids = np.sort(np.argsort(np.linalg.norm(seen, axis=1))[:3])
+        turns = so3.exp(
+            0.02 * rng.standard_normal((3, 3)) * (1.0 - is_planar, 1.0 - is_planar, 1.0)
+        )
+        estimator.add(
+            ObservationEvent(stamp_ns, ids, seen[ids], orientations=pose[:3, :3].T @ turns)
+        )
+    joint = estimator._state.errors.joint
+    assert joint.is_dense != is_large
+    assert both.moved >= 50 and not both.used[usual]
 
 
 @pytest.mark.parametrize('name', ['simulated loop, 3D stereo', 'simulated loop, wheeled'])
