@@ -58,15 +58,16 @@ class NormalisedInnovation:
 class Update:
     """The state at ``stamp_ns``, right after an observation of m known landmarks was used.
 
-    Residuals are those before the correction, along the world's axes; the rejected ones were too
-    far off to be used. ``lyapunov`` is L (34) of them all; k_i is ``gain_k`` whatever the gains.
-    Those of ``moved_ids`` are taken to be somewhere else from now on.
+    Residuals are from before the correction, along the axes that the world had then: it may have
+    been the robot's own frame, and the observation have shown where that lies in a loaded map. The
+    rejected ones were too far off to be used. ``lyapunov`` is L (34) of all; k_i is ``gain_k``
+    whatever the gains. Landmarks ``moved_ids`` are taken to be somewhere else from now on.
     ``innovation`` is None unless the estimator was asked for it.
     """
 
     stamp_ns: int
     pose: FloatArray  # (4, 4) body to world
-    ids: IntArray  # (m,)
+    ids: IntArray  # (m,) landmarks that were known before
     residuals: FloatArray  # (m, 3) r_i, metres
     rejected: BoolArray  # (m,)
     lyapunov: float
@@ -93,7 +94,7 @@ class CalibrationEstimate:
 
     @property
     def for_people(self) -> tuple[float, str]:
-        """The factor from ``unit`` to that which people read, and that: degrees for radians."""
+        """The factor to the unit that people read, and that unit: degrees for radians."""
         if not self.unit.startswith('rad'):
             return 1.0, self.unit
         return math.degrees(1.0), self.unit.replace('rad', '°', 1)
@@ -110,11 +111,11 @@ class CalibrationEstimate:
 
 @dataclass(frozen=True, slots=True)
 class MotionFactor:
-    """How noisy the odometry is over what is stated: in ``'turning'`` or in ``'driving'``.
+    """Noise of the odometry over the stated noise: in ``'turning'`` or in ``'driving'``.
 
-    Factors are of standard deviations: ``factor`` was found, and ``applied`` is in force.
-    ``deviation`` is that of the logarithm of ``factor``, and ``proposed`` are the settings that
-    state what was found.
+    Factors are of standard deviations: ``factor`` was found, and ``applied`` is in force. The
+    logarithm of ``factor`` has the standard ``deviation``; the ``proposed`` settings state this
+    factor.
     """
 
     name: str
@@ -124,7 +125,7 @@ class MotionFactor:
     proposed: str
 
     def __str__(self) -> str:
-        """Write what was found, and what is made of it."""
+        """Write the factor found, and the one in force."""
         found = f'{self.factor:.2f} × as stated (± {100.0 * self.deviation:.0f} %)'
         return f'{found}, taken as {self.applied:.2f} ×'
 

@@ -2,8 +2,8 @@
 
 Each has ``stamp_ns``, its time of validity, ``receive_ns``, when it was received by any clock
 that goes on steadily, or None, and ``sensor_frame``, the frame in which decoders give it.
-``moved`` brings it into another one; the estimator wants that of the base. A covariance is along
-the axes of the same frame; one that is None, or all zero, is unknown. Arrays are not copied: who
+``moved`` brings it into another frame; the estimator wants the base frame. A covariance is along
+the axes of the same frame; if it is None, or all zero, it is unknown. Arrays are not copied: who
 has added an event must not change them any more.
 """
 
@@ -64,14 +64,14 @@ class VelocityEvent:
         if covariance is not None:
             is_linear_known = covariance[3:, 3:].any()
             covariance = _turned(covariance, Ad)
-            if not is_linear_known:  # what the lever arm adds to it would pass for all of it
+            if not is_linear_known:  # the lever arm's part would pass for all of it
                 covariance[3:] = covariance[:, 3:] = 0.0
         return replace(self, body_velocity=Ad @ self.body_velocity, covariance=covariance)
 
 
 @dataclass(slots=True, eq=False)  # not frozen, which would take a microsecond more
 class VelocityBlock:
-    """k velocity events that came one after the other, as arrays; ``is_mean`` is that of all."""
+    """k velocity events that came one after the other, as arrays; they share ``is_mean``."""
 
     kind: ClassVar = VelocityEvent.kind
     stamps_ns: IntArray  # (k,)
@@ -86,7 +86,7 @@ class VelocityBlock:
 
     @property
     def stamp_ns(self) -> int:
-        """That of the first one."""
+        """The stamp of the first one."""
         return int(self.stamps_ns[0])
 
     def part(self, rows: slice) -> VelocityBlock:
@@ -207,10 +207,10 @@ Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
 
 
 MeasuredVelocity: TypeAlias = VelocityEvent | VelocityBlock | AngularVelocityEvent
-"""What leads on: one velocity, or several that follow each other."""
+"""One velocity, or several that follow each other."""
 
 Queued: TypeAlias = MeasuredVelocity | ObservationEvent
-"""What is put in order of stamps, and then used."""
+"""An event as it is put in order of stamps, and then used."""
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:

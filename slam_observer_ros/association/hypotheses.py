@@ -34,7 +34,7 @@ from slam_observer_ros.association.joint_compatibility import (
 )
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
-from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
@@ -44,7 +44,6 @@ from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, step
-from slam_observer_ros.state.usual import Outcome
 
 MOST_WITHOUT_IDS = 2
 """Hypotheses that are followed at most where points have no ids: each costs as much as the first,
@@ -54,11 +53,11 @@ and a third one is hardly ever the right one.
 
 @dataclass(frozen=True, slots=True)
 class _Child:
-    """A hypothesis after an observation, the meaning that it took it in, and the outcome."""
+    """A hypothesis after an observation, the meaning that it took it in, and what that did."""
 
     hypothesis: Hypothesis
     event: ObservationEvent
-    outcome: Outcome
+    update: Update
 
 
 class Hypotheses:
@@ -218,8 +217,8 @@ class Hypotheses:
         """Landmarks that move with the robot, and are not used."""
         return self._standing.carried
 
-    def observe(self, event: ObservationEvent) -> Outcome:
-        """Use an observation made at their instant; return its outcome for the best one."""
+    def observe(self, event: ObservationEvent) -> Update:
+        """Use an observation made at their instant; return what it did to the best one."""
         standing = self._standing
         if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
             self._judge(event)
@@ -246,12 +245,12 @@ class Hypotheses:
             for landmark_id in newly:
                 self.forget(landmark_id)
 
-    def _observe(self, event: ObservationEvent) -> Outcome:
+    def _observe(self, event: ObservationEvent) -> Update:
         """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        if len(self._all) == 1 and (outcome := in_parts.observe(self.best, event)) is not None:
+        if len(self._all) == 1 and (used := in_parts.observe(self.best, event)) is not None:
             self._some_have_ids = True
-            return outcome
+            return used[0]
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         if not self._can_weigh:
@@ -269,9 +268,9 @@ class Hypotheses:
             hypothesis.cost -= least_cost
         if unknown:
             self._new_landmarks.note(event, self._all[0].visibility.confirmed_now)
-        return children[0].outcome
+        return children[0].update
 
-    def _observe_alone(self, event: ObservationEvent) -> Outcome:
+    def _observe_alone(self, event: ObservationEvent) -> Update:
         """Use an observation that can't be weighed: of a state without a joint covariance."""
         matched = match(self.best, event)
         if self._rejected.explain_by_slip(self.best, matched):
@@ -308,10 +307,10 @@ class Hypotheses:
         self, hypothesis: Hypothesis, taken: Interpretation, event: ObservationEvent
     ) -> _Child:
         """Let a hypothesis use an observation as one interpretation has it."""
-        state, outcome = hypothesis.state, taken.outcome
-        if outcome is None:
+        state, update = hypothesis.state, taken.update
+        if update is None:
             state.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
-            outcome = step(state, taken.matched or match(state, taken.event))
+            update = step(state, taken.matched or match(state, taken.event))
         if taken.disbelieved is not None:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
@@ -319,14 +318,14 @@ class Hypotheses:
         if (event.ids == UNKNOWN_ID).any():
             hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
-        return _Child(hypothesis, taken.event, outcome)
+        return _Child(hypothesis, taken.event, update)
 
     def _interpret(
         self, event: ObservationEvent, matched: MatchedObservation | None
     ) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.
 
-        Their costs include that of the hypothesis. A point that is taken for a new landmark has
+        Their costs include the hypothesis's own. A point that is taken for a new landmark has
         the same id in all of them. ``matched`` is the observation as a single hypothesis has
         matched it, None where there are several.
         """
@@ -363,7 +362,7 @@ class Hypotheses:
             return interpretations(state, index, seen, matched, new_ids, new_cost, budget, True)
         used = in_parts.observe(state, event, is_weighed=True)
         if used is not None:
-            found = [as_its_ids_say(state, seen, used)]
+            found = [as_its_ids_say(state, seen, *used)]
         else:
             matched = match(state, seen)
             found = interpretations(state, index, seen, matched, new_ids, new_cost, budget)

@@ -243,9 +243,9 @@ class Hypothesis:
     """A state, with the helpers for points without an id."""
 
     state: State
-    visibility: Visibility  # what is in view of a sensor that gives no ids
+    visibility: Visibility  # the view of a sensor that gives no ids
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
-    cost: float = 0.0  # −2 ln of its likelihood, over that of the most likely one
+    cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
     verdicts: Verdicts = field(default_factory=dict)
 
     @classmethod

@@ -28,13 +28,19 @@ from slam_observer_ros.association.costs import (
 from slam_observer_ros.association.hypothesis import LandmarkIndex, Verdicts
 from slam_observer_ros.association.joint_compatibility import joint_cost
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, are_far, far_from_the_others
-from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation, positions
+from slam_observer_ros.state.matching import (
+    Expected,
+    is_contradiction,
+    match,
+    MatchedObservation,
+    positions,
+)
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.usual import Outcome
 
 
 def _none() -> IntArray:
@@ -56,7 +62,7 @@ class Interpretation:
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
     matched: MatchedObservation | None = None  # with the landmarks of these ids, where it is so
-    outcome: Outcome | None = None  # where the state has already used it so
+    update: Update | None = None  # where the state has already used it so
 
 
 def interpretations(
@@ -104,14 +110,16 @@ def _of_suspects(found: list[Interpretation], suspects: IntArray) -> list[Interp
     return [replace(one, suspects=suspects) for one in found] if len(suspects) else found
 
 
-def as_its_ids_say(state: State, event: ObservationEvent, outcome: Outcome) -> Interpretation:
+def as_its_ids_say(
+    state: State, event: ObservationEvent, update: Update, expected: Expected | None
+) -> Interpretation:
     """Return the only meaning of an observation that a state has used as usual."""
-    expected, m = outcome.expected, len(event.ids)
+    m = len(event.ids)
     cost = m * outlier_cost(state)
     if expected is not None:
         paired_cost = joint_cost(expected.r, expected.S, expected.R)
         cost = paired_cost + (m - len(expected.r)) * outlier_cost(state)
-    return Interpretation(event, cost, outcome=outcome)
+    return Interpretation(event, cost, update=update)
 
 
 def _without(

@@ -224,8 +224,9 @@ def _of_run(outcome: ReplayOutcome) -> Iterator[Finding]:
     result = outcome.result
     estimator, counts = result.estimator, result.estimator.counts
     yield from of_rejections(counts)
-    yield from of_estimate(estimator)
+    # What ranges are taken for comes first: where that is wrong, noise makes up for it.
     yield from of_ranges(result.range_power, estimator.settings.range_is_depth)
+    yield from of_estimate(estimator)
     nis = None if outcome.recorder is None else outcome.recorder.mean_nis
     yield from of_fit(None if nis is None else math.sqrt(nis))
     if result.in_known_map and estimator.settings.localization_mode != 'off':

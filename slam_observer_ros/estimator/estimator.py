@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 import logging
 import math
 import time
@@ -33,13 +34,10 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityBlock,
 )
-from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.loop_closure import LoopClosure
-from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import checked, table
-from slam_observer_ros.state.usual import Outcome
 
 logger = logging.getLogger(__name__)
 
@@ -53,15 +51,15 @@ class Estimator(Estimate):
     The state advances only at event stamps, in stamp order, so its bits don't depend on when
     anybody asks for them: a live run and a replay of what it received agree exactly.
 
-    ``initial_pose`` (4, 4), body to world, is that at the first event, and the reference P°; by
-    default that of the settings, or identity. :exc:`ParameterError` is raised if it is no rigid
-    motion, or if one of the ``settings`` does not fit its table.
+    ``initial_pose`` (4, 4), body to world, is the pose at the first event, and the reference P°;
+    by default the settings say it, or it is identity. :exc:`ParameterError` is raised if it is no
+    rigid motion, or if one of the ``settings`` does not fit its table.
 
-    ``on_update`` is called with an :class:`Update` after each observation that was used;
-    ``on_stamps`` with the stamps (s,), nanoseconds, of which all events have been used, and since
-    which the state has only been moved on by velocities: before the first event of a later stamp
-    or after a jump of the clock that holds the pose, and by :meth:`flush`; ``on_motion`` with
-    velocities and two stamps, nanoseconds, before the state is moved on between these; and
+    ``on_update`` is called with an :class:`Update` after each observation that was used.
+    ``on_stamps`` is called with stamps (s,), nanoseconds, when all their events have been used:
+    before the first event of a later stamp, after a jump of the clock that holds the pose, and by
+    :meth:`flush`; since the first of them only velocities have moved the state. ``on_motion`` is
+    called with velocities and two stamps before the state is moved on between these, and
     ``on_jump`` when the estimate has gone on after a jump of the clock. ``judges_innovations``
     adds :attr:`.Update.innovation`, which takes time.
     """
@@ -89,8 +87,8 @@ class Estimator(Estimate):
     def reset(self, pose: FloatArray | None = None) -> None:
         """Forget the motion, what was mapped and events held back, and start again.
 
-        At ``pose`` (4, 4), body to world; by default at that of the settings, or else at identity,
-        or unknown in a loaded map. Raise :exc:`ParameterError` if it is no rigid motion.
+        The pose is then ``pose`` (4, 4), body to world; by default as the settings say, or else
+        identity, or unknown in a loaded map. Raise :exc:`ParameterError` if it is no rigid motion.
         """
         self._start_pose = None if pose is None else rigid(pose)
         self._placement.reset(self._start_pose)
@@ -133,15 +131,15 @@ class Estimator(Estimate):
     ) -> None:
         """Estimate in the frame of a map from now on, as ``localization_mode`` says.
 
-        Of several maps it is the one in which the robot is found; a given pose is then where it is
-        looked for in each of them.
+        Of several maps it is the one in which the robot is found; in each of them the robot is
+        looked for about a given pose.
 
-        With a ``pose`` (4, 4) in that frame and its ``pose_covariance`` (6, 6; default exact),
-        what was mapped is forgotten. By default the pose is that of the settings, if the robot is
-        still there, or unknown: then it follows from landmarks of the map that are seen, three in
-        space or two in a plane, if they have ids, and what was mapped is carried into the map's
-        frame. Raise MapError or ParameterError if one of them can't be right; nothing is changed
-        then.
+        With a ``pose`` (4, 4) in that frame and its ``pose_covariance`` (6, 6; default exact) the
+        landmarks mapped so far are forgotten. By default the settings say the pose, if the robot
+        is still at its start; else it is unknown, and follows from landmarks of the map that are
+        seen, three in space or two in a plane if they have ids. Then landmarks mapped so far are
+        carried into the map's frame. Raise MapError or ParameterError if one of them can't be
+        right; nothing is changed then.
         """
         maps = usable_maps(landmark_map)
         if self.settings.localization_mode == 'off':
@@ -220,7 +218,10 @@ class Estimator(Estimate):
         return self._queue.follow(velocities)
 
     def _take(self, item: Queued) -> None:
-        """Use what is right in itself, in its order; InvalidEventError if its stamp is not."""
+        """Use an event that is right in itself, in its order.
+
+        Raise InvalidEventError if its stamp can't be right.
+        """
         if self._queue.passes(item):  # as nearly always
             self._process(item)
             return
@@ -266,7 +267,7 @@ class Estimator(Estimate):
         self._warnings.warn('dropped_message', error.reason, reason=error.reason, error=error)
 
     def _process(self, item: Queued) -> None:
-        """Use what has its turn: what is of one stamp, or velocities that follow each other."""
+        """Use an event whose turn it is, or velocities that follow each other."""
         if isinstance(item, ObservationEvent):
             if self._on_stamps is not None:
                 self._report_before(item.stamp_ns)
@@ -314,19 +315,34 @@ class Estimator(Estimate):
         event = self._timeline.synchronise(usable)
         if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
             self._placement.doubt(*self.uncertain_pose)
-        outcome = self._hypotheses.observe(event)
+        update = self._hypotheses.observe(event)
+        self._counts['observation'] += 1
+        self._counts['late_observation'] += self._timeline.was_late
+        may_have_moved = self._follow_up(event, update)
+        self._warn_of(event, update)
+        if may_have_moved:
+            update = replace(update, pose=self._state.observer.pose)
+        self.last_update = update
+        if self._on_update is not None:
+            self._on_update(update)
+
+    def _follow_up(self, event: ObservationEvent, update: Update) -> bool:
+        """Find the pose in a map, close a loop, or start again, as an observation gives reason.
+
+        Return whether that may have moved the robot.
+        """
         if self._localiser.maps:
-            self._placement.localise(event, outcome)
-        if np.count_nonzero(event.ids == UNKNOWN_ID):
+            self._placement.localise(event, update)
+        some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
+        if some_are_unknown:
             is_alone = len(self._hypotheses) == 1
             if self._loop_closure.follow(self._state, event.stamp_ns, is_alone=is_alone):
                 self._hypotheses.prune_to_best()
-        self._counts['observation'] += 1
-        self._counts['late_observation'] += self._timeline.was_late
-        self._warn_of(event, outcome)
-        self.last_update = self._update(event.stamp_ns, outcome)
-        if self._on_update is not None:
-            self._on_update(self.last_update)
+        distance_m = math.hypot(*self._state.observer.A[:3, 3].tolist())
+        has_diverged = not distance_m <= DIVERGED_M  # or it is no number
+        if has_diverged:
+            self._start_again(distance_m)
+        return bool(self._localiser.maps) or some_are_unknown or has_diverged
 
     def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""
@@ -338,34 +354,18 @@ class Estimator(Estimate):
         self._counts['diverged'] += 1
         self._placement.start(None)
 
-    def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
-        """Warn of what is wrong with an observation, its outcome, or the map."""
+    def _warn_of(self, event: ObservationEvent, update: Update) -> None:
+        """Warn of an observation, of what it did, or of the map if something is wrong."""
         warnings, state = self._warnings, self._state
         limit = self.settings.max_landmarks if state.is_mapping else 0
         if 0 < limit < len(event.ids):
             warnings.warn('more_than_max', count=len(event.ids), limit=limit)
-        if len(outcome.moved_ids):
-            warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
+        if len(update.moved_ids):
+            warnings.moved_landmarks(update.moved_ids, event.stamp_ns)
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
         warnings.large_map(len(state.landmarks), limit, state.gains)
-        distance_m = math.hypot(*state.observer.A[:3, 3].tolist())
-        if not distance_m <= DIVERGED_M:  # nor is what is no number
-            self._start_again(distance_m)
-
-    def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
-        observer = self._state.observer
-        return Update(
-            stamp_ns,
-            observer.pose,
-            outcome.ids,
-            se3.rotate(observer.reference_pose, outcome.residuals),
-            outcome.rejected,
-            lyapunov(self.settings.gain_k, outcome.residuals),
-            outcome.moved_ids,
-            outcome.innovation,
-        )
 
     def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""

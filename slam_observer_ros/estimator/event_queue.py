@@ -22,19 +22,19 @@ from slam_observer_ros.events import (
 Key: TypeAlias = tuple[int, bool, bytes]
 
 RECENT = 1000
-"""Events from which it is known how far ahead of their reception stamps are.
+"""Events that show how far stamps are ahead of their reception.
 
-More than inputs keep while the node is busy: those were received late, and show no delay.
+They are more than inputs keep while the node is busy: such were received late, and show no delay.
 """
 
 HELD_UP_NS = 250_000_000
-"""Stamps far behind that are received so soon after one in time are of no jump of the clock."""
+"""Stamps far behind, received so soon after one in time, are no sign of a jump of the clock."""
 
 LATENESS_NS = 10_000_000_000
-"""Time over which it is seen how late events are, nanoseconds."""
+"""Time over which the lateness of events is observed, nanoseconds."""
 
 LATENESS_MARGIN = 2
-"""How much later than the latest of that time an event may be and still be put in order."""
+"""Times the lateness of the latest one of that time that an event may have to be put in order."""
 
 MIN_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
@@ -49,9 +49,9 @@ _NO_STAMP_NS = 2**63 - 1
 class EventQueue:
     """Holds events back for a reorder window, then returns them in stamp order.
 
-    The window is as long as events are late: ``LATENESS_MARGIN`` times the most that one was in
-    the last ``LATENESS_NS``, ``window_ns`` at most, and that while so much time has not passed.
-    It depends on stamps and their order alone, so that a replay has the same.
+    The window is ``LATENESS_MARGIN`` times as long as the latest event of the last ``LATENESS_NS``
+    was late, and ``window_ns`` at most; until so much time has passed it is ``window_ns``. It
+    depends on stamps and their order alone, so that a replay has the same.
 
     Of two events with one stamp the velocity comes first, and two observations are ordered by
     a digest of their ids and points, so the order does not depend on which arrived first. A
@@ -64,10 +64,10 @@ class EventQueue:
     events come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
     received for as long: then it was a silence, not the clock.
 
-    Stamps behind all others are refused. ``AGREEING_STAMPS`` in a row are a jump of the clock,
-    but only where those of one kind of event go back themselves, as a sensor that is always too
-    late goes on from its own last stamp, and not right after an event that is in time: then they
-    were held up on the way, and come in a burst.
+    Stamps behind all others are refused. ``AGREEING_STAMPS`` in a row are a jump of the clock if
+    the stamps of one kind of event go back: a sensor that is always too late goes on from its own
+    last stamp. Right after an event that is in time they are no jump: they were held up on the
+    way, and come in a burst.
 
     An event is returned at most ``window_ns`` behind the newest stamp, and may be
     ``late_limit_ns`` behind that; ``max_jump_ns`` is the longest pause, beyond which stamps are
@@ -215,7 +215,7 @@ class EventQueue:
 
 
 class _Window:
-    """How long events are held back, by how late those of the recent past were."""
+    """How long events are held back, by how late events of the recent past were."""
 
     def __init__(self, longest_ns: int) -> None:
         self._longest_ns = longest_ns
@@ -280,7 +280,7 @@ class _SortedEvents:
         return ready
 
     def _cut(self, velocities: VelocityBlock, stamp_ns: int) -> VelocityBlock:
-        """Return what comes until a stamp, and before what is next; the others are held back."""
+        """Return the velocities until a stamp and before the next event; hold back the others."""
         end: Key = (stamp_ns, True, b'')
         if self.held:
             end = min(end, self.held[0][0])

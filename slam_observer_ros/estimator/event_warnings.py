@@ -31,11 +31,11 @@ MOVED_LATELY_NS = 60 * NANOSECONDS_PER_SECOND
 """How long ago that is at most, nanoseconds."""
 
 UNEXPECTED_POSES = ('slip', 'unexpected_place', 'doubled_landmark')
-"""What is wrong with the robot's pose when these counts grow."""
+"""Counts that grow when something is wrong with the robot's pose."""
 
 
 class EventWarnings:
-    """Counts what there is to warn of, and logs it more and more seldom."""
+    """Counts findings of each kind, and logs them more and more seldom."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()

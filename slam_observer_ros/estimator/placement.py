@@ -9,6 +9,7 @@ import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -16,7 +17,6 @@ from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.settings.estimator_settings import LiveSettings
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.usual import Outcome
 
 logger = logging.getLogger(__name__)
 
@@ -86,11 +86,11 @@ class Placement:
             self.start(None)
             self.localiser.search_near(pose, covariance)
 
-    def localise(self, event: ObservationEvent, outcome: Outcome) -> None:
+    def localise(self, event: ObservationEvent, update: Update) -> None:
         """Look for the pose in a loaded map if it is not known, or not any more."""
         localiser, hypotheses = self.localiser, self.hypotheses
         missed = hypotheses.missed
-        reason = localiser.reason_to_reset(hypotheses.best, event, outcome, missed)
+        reason = localiser.reason_to_reset(hypotheses.best, event, update, missed)
         if reason is not None:
             logger.warning('%s; localising again.', reason)
             self.start(None)

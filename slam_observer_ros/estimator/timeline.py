@@ -195,17 +195,17 @@ def carried_forward(
 ) -> ObservationEvent:
     """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since ``event``.
 
-    Its points are as uncertain as any seen from there, and as that motion makes them. Its
-    error is one and the same for all m, but is given to each as its own: m would average it
-    down. Where velocities of landmarks are estimated, v may be anything that they may be.
+    Its points are as uncertain as any seen from there, and more by the motion. The motion's error
+    is one for all m points, which would average it down: each is given m times its covariance.
+    Where velocities of landmarks are estimated, v is as uncertain as they may be.
     """
-    # The motion of the robot since then, and that of the landmarks.
+    # The motion of the robot since then, and of the landmarks.
     interval = (event.stamp_ns, state_ns)
     lag_s, calibration = to_s(state_ns - event.stamp_ns), state.calibration
     back = se3.inverse(transition(velocities, calibration, *interval))
     shifts = _landmark_velocities(state, event, state.observer.A @ back) * lag_s
     points = event.points + shifts
-    # The sensor with it, so that it was measured from as far.
+    # The sensor with them: the distance stays as it was measured.
     sensor = shifts if event.sensor is None else event.sensor + shifts
     shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
     moved = shifted.moved(back)

@@ -12,12 +12,12 @@ import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.types import FloatArray, is_automatic
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import pose_by_tag, TagPose
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.usual import Outcome
 
 if TYPE_CHECKING:
     from slam_observer_ros.known_map.finder import Finder
@@ -123,7 +123,7 @@ class Localiser:
         logger.info('Searching %s about the pose that was given.', self._where)
 
     def reason_to_reset(
-        self, state: State, event: ObservationEvent, outcome: Outcome, missed: float
+        self, state: State, event: ObservationEvent, update: Update, missed: float
     ) -> str | None:
         """Return why the pose in the map must be wrong after an observation, or None.
 
@@ -132,7 +132,7 @@ class Localiser:
         if self.loaded is None:
             return None
         reason = None
-        if self._trial is not None and self._trial.vote(outcome, state.settings.max_rejections):
+        if self._trial is not None and self._trial.vote(update, state.settings.max_rejections):
             reason = 'Most landmarks contradict the pose that was given'
             if self._tag is not None:
                 reason = f'Most landmarks contradict the pose that tag {self._tag} gave'
@@ -292,12 +292,12 @@ class PoseTrial:
         """Whether no observation has voted yet."""
         return self._for == self._against == 0
 
-    def vote(self, outcome: Outcome, often: int) -> bool:
+    def vote(self, update: Update, often: int) -> bool:
         """Count the vote of an observation; return whether ``often`` ones say it is wrong."""
         if self._for >= CONFIRMING_VOTES and self._for > self._against:
             return False
-        rejected = int(np.isin(outcome.ids[outcome.rejected], self._ids).sum())
-        accepted = int(np.isin(outcome.ids, self._ids).sum()) - rejected
+        rejected = int(np.isin(update.ids[update.rejected], self._ids).sum())
+        accepted = int(np.isin(update.ids, self._ids).sum()) - rejected
         self._for += int(accepted > 0 and accepted >= rejected)
         self._against += int(rejected > accepted)
         return self._against >= often and self._against > self._for

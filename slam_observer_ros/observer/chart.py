@@ -4,9 +4,9 @@
 
     Â = exp(ε) A,     ξ_i = ã_i + [ŷ_i]× ε_Ω,     B̂_i = exp(ω_i) B_i,     ũ_i = û_i − R_Ã u_i
 
-with ã_i the error of the estimate ŷ_i = y_i° + â_i in the reference frame, c̃ that of the
-calibration, and on estimated axes: p of ε, k of a point, q of a turn. A point or tag that moves
-with the pose has ξ_i = ε_v and ω_i = ε_Ω, so that what is seen says
+Here ã_i is the error of the estimate ŷ_i = y_i° + â_i in the reference frame, c̃ the error of the
+calibration; estimated axes are p of ε, k of a point, q of a turn. A point or tag that moves with
+the pose has ξ_i = ε_v and ω_i = ε_Ω, so that observations have the residuals
 
     r_i = ε_v − ξ_i + R̂ D_i c̃,        φ_i = ε_Ω − ω_i + R̂ D c̃
 
@@ -98,7 +98,7 @@ class Chart:
         columns = self.first + np.arange(self.stride)
         return (columns + self.stride * rows[:, None]).ravel()
 
-    # What is seen: r_i = C_i (ε, c̃) − ξ_i, and φ_i = C (ε, c̃) − ω_i
+    # Observations: r_i = C_i (ε, c̃) − ξ_i, and φ_i = C (ε, c̃) − ω_i
 
     def output(self, shifts: FloatArray, D: FloatArray | None) -> FloatArray:
         """Return C_i (m, k, p), or (m, k, p + c), of points at ``shifts`` (m, 3) from ŷ_i.

@@ -1,6 +1,6 @@
-"""What the usual step reads and writes, as plain arrays and numbers: one layout in numpy and in C.
+"""Plain arrays and numbers that the usual step reads and writes: one layout in numpy and in C.
 
-Arrays are contiguous, of float64 or int64. Frames and units are those of :mod:`.observer`.
+Arrays are contiguous, of float64 or int64. Frames and units are as in :mod:`.observer`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ class Estimate(NamedTuple):
     A: FloatArray  # (4, 4) Â
     y_ref: FloatArray  # (n, 3) y_i° of the landmarks that P has
     a: FloatArray  # (n, 3) â_i, changed in place
-    P: FloatArray  # (room, room) of which the first N rows and columns count, changed in place
+    P: FloatArray  # (room, room) whose first N rows and columns count, changed in place
     size: int  # N
-    first: int  # the first column of the landmarks; what is postponed is between p + c and it
-    stride: int  # columns of a landmark, those of its point first: more than k of a tag
+    first: int  # the first column of the landmarks; between p + c and it are postponed ones
+    stride: int  # columns of a landmark, its point's first: more than k of a tag
     is_planar: bool  # whether p is 3 and k is 2, in place of 6 and 3
     rates: FloatArray  # (6, 7) [M b] of velocities M V + b
-    estimated: IntArray  # (c_v,) which of these, row by row, c̃ begins with; 42 is the delay, last
-    drift: FloatArray  # (c, c) what a second adds to the covariance of c̃
+    estimated: IntArray  # (c_v,) entries of it, row by row, that c̃ begins with; 42 is the delay
+    drift: FloatArray  # (c, c) growth of the covariance of c̃ in a second
 
 
 class Interval(NamedTuple):
@@ -38,18 +38,18 @@ class Interval(NamedTuple):
 
 
 class Advanced(NamedTuple):
-    """What a motion did, written by :func:`.advance`."""
+    """The effect of a motion, written by :func:`.advance`."""
 
     A: FloatArray  # (4, 4) Â at its end
-    noise: FloatArray  # (p, p) what it added to the covariance of ε
-    of_turning: FloatArray  # (p, p) which part of that grows with the factor of turning
+    noise: FloatArray  # (p, p) added to the covariance of ε
+    of_turning: FloatArray  # (p, p) the part of it that grows with the factor of turning
     sensitivity: FloatArray  # (p, c) F, how ε grows with the errors of the calibration
     at_end: FloatArray  # (6,) mean velocity about the end
     variances: FloatArray  # (6,) of the motion by axis, body frame, rad² and m²
 
 
 class Landmarks(NamedTuple):
-    """What is known of each of n landmarks, changed in place."""
+    """Counts and stamps of n landmarks, changed in place."""
 
     counts: IntArray  # (n,) as in :class:`.LandmarkTable`, and so the others
     rejections: IntArray
@@ -64,10 +64,10 @@ class Seen(NamedTuple):
     rows: IntArray  # (m,) which landmarks they are of
     arms: FloatArray  # (m, 3) from the sensor to each point, metres
     origins: FloatArray | None  # (m, 3) where the sensor was, metres; None at the base
-    covariances: FloatArray | None  # (m, 3, 3) as stated, m²; None for those of the figures
+    covariances: FloatArray | None  # (m, 3, 3) as stated, m²; None where the figures have them
     sensor: FloatArray | None  # (7,) ψ, d and s of the sensor, rad and m
-    of_sensor: IntArray  # (c_s,) which of these are estimated
-    column: int  # of c̃ where these begin
+    of_sensor: IntArray  # (c_s,) which of ψ, d and s are estimated
+    column: int  # of c̃ where they begin
 
 
 class Limits(NamedTuple):
@@ -82,20 +82,20 @@ class Limits(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """What an observation did, written by :func:`.observe`."""
+    """The effect of an observation, written by :func:`.observe`."""
 
     A: FloatArray  # (4, 4) Â after it
     points: FloatArray  # (m, 3) where, by the calibration of the sensor, body frame
     r: FloatArray  # (m, 3) residuals (29)
-    weights: FloatArray  # (m,) Huber's; of a point that is rejected 0
+    weights: FloatArray  # (m,) Huber's, 0 for a rejected point
     origins: FloatArray  # (m, 3) where the sensor was, body frame
     lines_of_sight: FloatArray  # (m, 3) from the sensor to where each should be now
     # (m, 3, 3) of the points, body frame, m²; (0, 3, 3) where none were stated
     covariances: FloatArray
     dt_s: FloatArray  # (m,) since each was seen before; infinite if it was not
-    moved: FloatArray  # (first,) −K r of pose, calibration and what is postponed
+    moved: FloatArray  # (first,) −K r of pose, calibration and postponed columns
     # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
     # normalised innovation squared of all; empty where nobody asks
     judged: FloatArray
-    # S (m k, m k) of the residuals, m², then R (m, k, k), what of that is of the points; or empty
+    # S (m k, m k) of the residuals, m², then R (m, k, k), the points' part of it; or empty
     expected: FloatArray

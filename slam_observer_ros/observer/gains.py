@@ -122,7 +122,7 @@ class Gains(ABC):
     """What moves an ``observer``'s X̂, which starts at ``reference_pose`` P° (4, 4)."""
 
     ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect
-    errors: Errors | None = None  # what is known of those of pose and landmarks together
+    errors: Errors | None = None  # of pose and landmarks together, if their covariance is known
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings

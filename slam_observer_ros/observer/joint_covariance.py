@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 class JointCovariance:
     """P, kept in ``matrix``, and which of its columns are whose."""
 
-    # Whether all landmarks are in P, and the rows of those that are, in its order: a correction
+    # Whether all landmarks are in P, and the rows of its landmarks in its order: a correction
     # moves these. See :class:`.CompressedCovariance`.
     is_dense = True
     active: IntArray | slice = slice(None)

@@ -1,18 +1,18 @@
-"""The core of scheduled gains: what is estimated jointly, however many landmarks there are.
+"""The core of scheduled gains: few errors that are estimated jointly, in a map of any size.
 
-The core z = (ε, c, ã_1 … ã_K) are the errors of the pose, of the velocity's calibration, and of
-the K landmarks seen last; P is their covariance. What they know of each other is all here, and
-how other landmarks depend on them is in :class:`.PostponedLandmarks`.
+The core z = (ε, c, ã_1 … ã_K) has the errors of the pose, of the velocity's calibration, and of
+the K landmarks seen last; P is their covariance. How other landmarks depend on them is in
+:class:`.PostponedLandmarks`.
 
 When the core becomes z' = Φ z + noise, because the robot moves or one landmark replaces another,
 z = G z' + ζ with the regression G = P Φᵀ P'⁻¹, and ζ has the covariance V = P − G Φ P, here in
 Joseph's form. The postponed landmarks, which depend on the core, follow both.
 
 The error of a postponed landmark i is ã_i = F_i z + η_i, with η_i ~ N(0, N_i) independent of all
-else. What is observed of the core, or of other landmarks, changes neither F_i nor N_i. It moves
-the estimate of z, by x, and with it that of the landmark, by F_i x. When the core itself becomes
-another one, z = G z' + ζ with ζ ~ N(0, V) independent of z', then F_i becomes F_i G, and N_i
-becomes N_i + F_i V F_iᵀ. A sequence of such changes is one such change:
+else. An observation of the core, or of other landmarks, changes neither F_i nor N_i. It moves the
+estimate of z by x, and so the landmark by F_i x. When the core becomes another one, z = G z' + ζ
+with ζ ~ N(0, V) independent of z', then F_i becomes F_i G, and N_i becomes N_i + F_i V F_iᵀ. A
+sequence of such changes is one such change:
 
     (G, V, x) then (G', V', x')   =   (G G',  V + G V' Gᵀ,  x + G x')
 

@@ -1,9 +1,9 @@
 """The usual step in numpy: the reference that ``_core.c`` repeats, equation by equation.
 
-A motion along velocities without a gap, and an observation whose points are all of known
-landmarks, none of them in doubt. Anything else is UNUSUAL, and nothing is changed then: the
-filters' own methods go on from there, also where orientations of tags are seen. Points that are
-rejected, or of new landmarks, are left out by who calls it.
+It takes a motion along velocities without a gap, and an observation whose points are all of known
+landmarks that are not doubtful. Anything else is UNUSUAL, and nothing is changed then: the
+filters' own methods go on from there, also where orientations of tags are seen. The caller leaves
+out points that are rejected, or of new landmarks.
 
 The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, and ω_i of tags: see :mod:`.chart`.
 """
@@ -112,7 +112,7 @@ def advance(
         out.variances[:] += np.diagonal(stated.sum(axis=0))
         _add_summed(Ad, se3.at_poses(stated), out)
     F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
-    # x ← x + J (F c̃ + w), and ξ_i ← ξ_i + [ŷ_i]× ε_Ω of what is added to ε
+    # x ← x + J (F c̃ + w); ξ_i grows by [ŷ_i]× times the turn that is added to ε
     P, of_c = x.P, slice(p, p + c)
     JT = np.zeros((p, len(P)))
     JT[:, :p] = np.eye(p)
@@ -309,7 +309,7 @@ def _residuals(
     limits: Limits,
     out: Observed,
 ) -> _Residuals | None:
-    """Return the residuals (29); None where a landmark is in doubt."""
+    """Return the residuals (29); None where a landmark is doubtful."""
     rows = seen.rows
     counts, rejections = landmarks.counts.take(rows), landmarks.rejections.take(rows)
     if np.count_nonzero(rejections >= np.minimum(counts + 1, limits.max_rejections)):

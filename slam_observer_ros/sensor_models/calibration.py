@@ -1,8 +1,8 @@
 """Calibration as part of the state: of the velocity, by axis, and of each sensor of landmarks.
 
-V_true(t) = M V(t − τ) + b, where M has the scale factors 1 + s on its diagonal. The delay τ is how
-much later than its stamp a velocity shows in what is observed: a command takes a while to be
-obeyed, and an image a while to be stamped. A sensor's part, ψ, d and s of
+V_true(t) = M V(t − τ) + b, where M has the scale factors 1 + s on its diagonal. A velocity shows
+in observations later than its stamp, by the delay τ: a command takes a while to be obeyed, and an
+image a while to be stamped. A sensor's part, ψ, d and s of
 :mod:`slam_observer_ros.geometry.sensor_mounting`, begins with the first observation from its
 frame.
 """
@@ -126,7 +126,7 @@ class Calibration:
         self._set_variances(errors[self._places] ** 2)
 
     def of(self, owner: CalibrationOwner) -> Self:
-        """Return the same of a copy of the owner."""
+        """Return the calibration of a copy of the owner."""
         other = copy(self)
         other._owner = owner
         return other
@@ -137,7 +137,7 @@ class Calibration:
         self.drifts = bool(self.drift_covariance.any())
 
     def add_sensor(self, frame: str) -> FloatArray:
-        """Append what is estimated of the sensor of a new frame; return its variances (c_s,)."""
+        """Append the estimated entries of a new frame's sensor; return their variances (c_s,)."""
         more, owner = len(self._nominal) + self.of_sensor, self._owner
         self.sensors = (*self.sensors, frame)
         self._places = np.append(self._places, more)
@@ -166,7 +166,7 @@ class Calibration:
 
     @property
     def calibrates_sensors(self) -> bool:
-        """Whether some of the c entries are those of sensors."""
+        """Whether some of the c entries belong to sensors."""
         return self.count > self.of_velocity
 
     def sensor(self, frame: str) -> FloatArray:
@@ -176,7 +176,7 @@ class Calibration:
         return values
 
     def columns(self, frame: str) -> slice:
-        """Return which of the c entries are those of a sensor."""
+        """Return which of the c entries belong to a sensor."""
         each = len(self.of_sensor)
         first = self.of_velocity + each * self.sensors.index(frame)
         return slice(first, first + each)
@@ -233,9 +233,9 @@ class Calibration:
     def apply_to_covariance(
         self, covariance: FloatArray, body_velocity: FloatArray, variances: FloatArray
     ) -> FloatArray:
-        """Return the covariance (6, 6) of a calibrated velocity from that of the velocity (6,).
+        """Return the covariance (6, 6) of a calibrated velocity, given the velocity's own.
 
-        ``variances`` (c,) are what the filter knows of the estimates.
+        ``variances`` (c,) are of the estimates, by the filter.
         """
         M = self.rates[:, :MOVES]
         applied: FloatArray = M @ covariance @ M.T
@@ -252,9 +252,9 @@ class Calibration:
     ) -> FloatArray:
         """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
 
-        From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, so that velocities
-        were taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6) holds
-        the estimated rows of Ad_Â; the others are those of :class:`.Motion`.
+        It follows from ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay that is too long by τ̃, by which
+        velocities were taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6)
+        holds the estimated rows of Ad_Â; the other arguments are as in :class:`.Motion`.
         """
         if not self.count:
             return np.empty((Ad.shape[1], 0))

@@ -1,17 +1,17 @@
 """The motion between two stamps: velocities as the calibration has them, with their noise.
 
-And how much of an estimated delay is noise of the velocities, which passes for change.
-The delay τ follows from how velocities change from observation to observation, f = Σ W_i V_i with
-the weights W_i of their means around the two, in the noise of the motion between them. Noise n_i
-of V_i is in f, too: it adds to what seems to be known of τ; and it is in the motion, so that the
-estimate follows it. Per second of motion, with densities q stated and q_n ≤ q in the velocities,
+An estimated delay has a share of noise of the velocities, too, which passes for their change. The
+delay τ follows from how velocities change from one observation to the next, f = Σ W_i V_i with the
+weights W_i of their means around the two, by the noise of the motion between them. Noise n_i of
+V_i is in f, and seems to be information of τ; it is also in the motion, so that the estimate
+follows it. Per second of motion, with densities q stated and q_n ≤ q in the velocities, there are
 
-    information  Σ f²/q,   of which is noise  Σ (q_n/q) Σ W_i²/T,   pull  Σ (q_n/q) Σ W_i t_i/T
+    information  Σ f²/q,   noise in it  Σ (q_n/q) Σ W_i²/T,   pull  Σ (q_n/q) Σ W_i t_i/T
 
 for velocities that came every T, each in force for t_i of the motion. Where a share ρ of the
 information is noise, the estimate goes only the part 1 − ρ of the way that the filter takes it to
-go: of an error at the start the share (σ²/σ_0²)^(1 − ρ) is left when σ_0 has become σ. All of it
-is known from the velocities and the stated noise alone.
+go: of an error at the start the share (σ²/σ_0²)^(1 − ρ) is left when σ_0 has become σ. The
+velocities and the stated noise alone show all of it.
 """
 
 from __future__ import annotations
@@ -141,8 +141,8 @@ def _path(start: FloatArray, held: HeldVelocities, calibration: Calibration) -> 
 def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int) -> FloatArray:
     """Return the mean velocity (6,) around a stamp, as far as its delay may reach.
 
-    The velocity at the very stamp would pass its own noise off as a turn to read the time from; a
-    mean has less noise. What is yet to come of it, the latest velocity stands in for.
+    At the very stamp a velocity's own noise would pass for a change to read the time from; a mean
+    has less noise. The latest velocity stands for those that are yet to come.
     """
     reach_ns, centre_ns = calibration.delay_error_ns, stamp_ns - calibration.delay_ns
     return velocities.mean(centre_ns - reach_ns, centre_ns + reach_ns)

@@ -1,4 +1,4 @@
-"""A motion of the robot, as a filter is given it, and what is known at instants on its way."""
+"""A motion of the robot as a filter is given it, and a passage through instants on its way."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ class Motion:
     dt_s: FloatArray  # (k,) how long each was held
     covariances: FloatArray  # (k, 6, 6) of each piece, rad² and m²
     duration_s: float  # in all, with the time without a known velocity
-    # (2, 6) measured velocities around the start and the end; None where what moved does not
+    # (2, 6) measured velocities around the start and the end; None where the motion does not
     # depend on the delay of the velocities.
     at_ends: FloatArray | None
     calibration: Calibration  # which led along the path
-    is_slip: bool = False  # whether odometry has not seen it, so that it may not have been
+    is_slip: bool = False  # odometry has not seen it, and it may not have happened
 
     @cached_property
     def noise(self) -> FloatArray:
-        """(p, p) Σ Ad_Â Q Ad_Âᵀ, what the motion adds to the covariance of ε."""
+        """(p, p) Σ Ad_Â Q Ad_Âᵀ, which the motion adds to the covariance of ε."""
         return se3.summed_noise(self._adjoints, self.covariances)
 
     @property
     def noise_by_kind(self) -> FloatArray | None:
-        """(2, p, p) what turning and driving add to it; None if it stands or was not all measured.
+        """(2, p, p) parts of it by turning and driving; None if it stands or has gaps.
 
-        By how fast it grows with the factor of either: what errors of both share is half theirs.
+        A part is how fast the noise grows with the factor of either; a term that has errors of
+        both is divided in halves.
         """
         stands = not np.count_nonzero(self.measured_velocities)
         if self.is_slip or stands or np.count_nonzero(self.dt_s) < len(self.dt_s):
@@ -57,7 +58,7 @@ class Motion:
 
     @cached_property
     def drift(self) -> FloatArray:
-        """(c, c) what the motion's time adds to the covariance of the calibration."""
+        """(c, c) added to the covariance of the calibration in the motion's time."""
         return self.calibration.drift_covariance * self.duration_s
 
     def pose_covariance(self, P: FloatArray) -> FloatArray:
@@ -93,7 +94,7 @@ def _of_angular_part(covariances: FloatArray) -> FloatArray:
 class Passage:
     """Motion from one instant of the state to each of s others, in pieces of held velocity.
 
-    What is known at each of these is what :class:`.Motion` has of a motion that ends there.
+    At each of them it has what :class:`.Motion` has of a motion that ends there.
     """
 
     path: FloatArray  # (k + 1, 4, 4) Â before, between and after the whole pieces

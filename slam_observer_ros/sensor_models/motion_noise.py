@@ -185,11 +185,11 @@ def motion_variances(
 def stated_motion_covariances(
     covariances: FloatArray, dt_s: FloatArray, before_s: FloatArray, factors: FloatArray
 ) -> FloatArray:
-    """Return those (k, 6, 6) of what velocities with stated ones (k, 6, 6) move by.
+    """Return covariances (k, 6, 6) of motions by velocities with stated covariances (k, 6, 6).
 
-    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), seconds. What is stated is of one
-    error for as long as the velocity is held, and of another in the next message: held for t it
-    has moved the robot by t times the error, however many motions that was cut into.
+    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), seconds. A velocity has one error
+    for as long as it is held, and the next message another one: held for t it has moved the robot
+    by t times its error, in however many motions.
     """
     squared = dt_s[:, None] * (2.0 * before_s + dt_s[:, None])  # (before + dt)² − before²
     grown_s = np.repeat(np.sqrt(squared * factors), 3, axis=1)
@@ -218,7 +218,7 @@ class MotionFactors:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._least = LEAST[settings.motion_noise_factor]
-        # (2,) those of the variances in force: of turning, and of driving
+        # (2,) factors of the variances in force: of turning, and of driving
         self.applied: FloatArray = np.ones(2)
         self._logs = np.zeros(2)  # θ
         self._information = np.zeros((2, 2))  # F̄
@@ -267,7 +267,7 @@ class MotionFactors:
         self._found += 1
 
     def flat(self) -> Factors | None:
-        """Return what there is to learn from as plain arrays; None if there is nothing."""
+        """Return the factors, and the motion to learn from, as plain arrays; None without one."""
         if self._shares is None or not self._shares.ndim:
             return None
         return Factors(
@@ -279,7 +279,7 @@ class MotionFactors:
         )
 
     def take(self, factors: Factors | None) -> None:
-        """Take over what was learnt with these of :meth:`flat`."""
+        """Take over factors of :meth:`flat` that have learnt."""
         self.forget_motion()
         if factors is not None:
             self._logs, self._information = factors.logs, factors.information
@@ -287,7 +287,7 @@ class MotionFactors:
             self._found += 1
 
     def forget_motion(self) -> None:
-        """Let the motion until now be of no concern for what is seen next."""
+        """Learn nothing of the motion until now from the next observation."""
         self._shares = np.zeros(())
 
     def _score(

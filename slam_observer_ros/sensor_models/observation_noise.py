@@ -21,14 +21,14 @@ from slam_observer_ros.settings.estimator_settings import Settings
 RESOLUTION_M = 1e-4
 """Standard deviation that each coordinate of an observed point has at least.
 
-What claims to be better is lost in rounding beside a pose that may be off by a kilometre.
+A smaller one is lost in rounding beside a pose that may be off by a kilometre.
 """
 
 RELATIVE_RESOLUTION = 1e-6
 """The same as a share of the distance, for points in single precision or better."""
 
 RESOLUTION_RAD = 1e-4
-"""The same of an orientation, about each axis."""
+"""Least standard deviation of an orientation about each axis."""
 
 MAX_ERROR_M = 1e3
 """Standard deviation of an observed point beyond which a message only says 'unknown'."""

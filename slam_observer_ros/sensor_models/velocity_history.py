@@ -53,22 +53,22 @@ class VelocityHistory:
     """Velocities in stamp order, joined with the angular velocities of another sensor.
 
     A velocity is held for ``timeout_ns`` at most. Where the other sensor's angular one was older
-    when it came, the velocity's own angular part counts. With ``is_planar`` only what is in
-    the plane z = 0 counts.
+    when it came, the velocity's own angular part counts. With ``is_planar`` only parts in the
+    plane z = 0 count.
     """
 
     def __init__(self, timeout_ns: int, is_planar: bool = False) -> None:
         self._timeout_ns = timeout_ns
         self._is_planar = is_planar
-        # In force from each stamp to the next; the first is what is known before any event.
+        # In force from each stamp to the next; the first one is in force before any event.
         self._joined, self._count = _Joined.with_room_for(FIRST_CAPACITY), 1
         self._angular: AngularVelocityEvent | None = None
         self._periods, self._angular_periods = _Periods(), _Periods()
 
     def append(self, measured: MeasuredVelocity) -> bool:
-        """Add what is not earlier than anything else; return whether it leads on.
+        """Add velocities that are not earlier than any other; return whether they are in force.
 
-        An angular velocity does not before the first linear one is known: it waits for that.
+        An angular velocity waits for the first linear one.
         """
         if isinstance(measured, AngularVelocityEvent):
             self._angular_periods.add(measured.stamp_ns)
@@ -180,7 +180,7 @@ class VelocityHistory:
         until = np.zeros((len(stamps), 7))
         pieces = np.column_stack([known_s[:, None] * velocities[:-1], known_s])
         np.cumsum(pieces, axis=0, out=until[1:])
-        # … and until any time, each of which is held on as long as it was the latest one.
+        # … and until any time, with the last one before it held until then.
         sums = np.zeros((2, len(stamps_ns), 7))
         for of_each, times in zip(sums, (starts_ns, ends_ns), strict=True):
             rows = np.minimum(stamps.searchsorted(times, 'right') - 1, known)
@@ -392,7 +392,7 @@ class _Joined:
             self.is_stated[rows, 1] = covariances[..., 3:, 3:].any(axis=(-2, -1))
 
     def repeat_last(self, row: int, stamp_ns: int) -> None:
-        """Fill in a row with what is in force before it, from a stamp on."""
+        """Let the velocity before a row be in force from another stamp on, too."""
         for array in (self.body_velocities, self.covariances, self.is_stated, self.since_ns):
             array[row] = array[row - 1]
         self.stamps_ns[row] = stamp_ns

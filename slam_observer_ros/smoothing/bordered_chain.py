@@ -224,7 +224,7 @@ class _Stretches:
         return rows
 
     def border(self, equations: Equations) -> tuple[FloatArray, FloatArray]:
-        """Return what is left of D (b, b) and of its gradient (b,)."""
+        """Return D (b, b) and its gradient (b,) after the elimination."""
         b, columns = len(equations.corner), self._columns
         size, own = b + equations.seen.shape[2], slice(2 * self._d, -1)
         entries = size * columns[:, :, None] + columns[:, None]

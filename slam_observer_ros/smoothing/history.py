@@ -33,7 +33,7 @@ _Motion: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class Keyframe(NamedTuple):
-    """The m points of one observation after the correction, those of new landmarks included."""
+    """The m points of one observation after the correction, with new landmarks among them."""
 
     stamp_ns: int
     rows: IntArray  # (m,) which landmarks were seen
@@ -98,7 +98,7 @@ class History:
         self.summarised = 0
         self.since = since
         self.stamps_ns: list[int] = []  # of the keyframes
-        self.poses: list[FloatArray] = [prior.pose]  # estimates, then those of the keyframes
+        self.poses: list[FloatArray] = [prior.pose]  # then the keyframes' estimates
         self.calibrations = [prior.calibration]  # likewise
         self._calibration = prior.calibration
         self._start: FloatArray | None = None

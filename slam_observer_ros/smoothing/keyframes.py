@@ -144,7 +144,7 @@ def _joined_links(parts: list[Links]) -> Links:
 
 
 def no_turns(q: int) -> SeenTurns:
-    """Return those of points that show no orientation; q of a turn are estimated."""
+    """Return no tags; q axes of a turn are estimated."""
     no_rotations = np.empty((0, 3, 3))
     none = np.empty(0, dtype=np.int64)
     return SeenTurns(none, no_rotations, no_rotations, np.empty((0, q, q)))
@@ -170,7 +170,7 @@ def no_keyframes(d: int, c: int, k: int, q: int) -> Keyframes:
 
 
 def joined_turns(parts: list[SeenTurns], counts: list[int]) -> SeenTurns:
-    """Return those of several parts, one after the other, of so many points each."""
+    """Return the tags of several parts, one after the other; ``counts`` are of their points."""
     before = np.cumsum([0, *counts[:-1]])
     return SeenTurns(
         np.concatenate([part.points + first for part, first in zip(parts, before, strict=True)]),

@@ -59,7 +59,7 @@ class SensedPoints:
         return sensed.sensors, sensed.origins, sensed.arms, values, columns
 
     def turns(self, calibrations: FloatArray) -> FloatArray:
-        """Return exp(ψ) (M, 3, 3), by which what is seen of orientations is turned."""
+        """Return exp(ψ) (M, 3, 3), by which seen orientations are turned."""
         return so3.exp(self._values(calibrations)[:, :3])
 
     def turning(self, calibrations: FloatArray) -> FloatArray:

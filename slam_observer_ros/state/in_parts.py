@@ -1,7 +1,7 @@
 """Observations that the usual step uses: nearly always whole, else in parts.
 
-What is rejected, or of new landmarks, is counted and entered over the same arrays afterwards, as
-:mod:`.step` does it.
+Points that are rejected are counted afterwards, over the same arrays, and those of new landmarks
+entered, as :mod:`.step` does it.
 """
 
 from __future__ import annotations
@@ -9,26 +9,30 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, IntArray, is_automatic
-from slam_observer_ros.estimates import NormalisedInnovation
+from slam_observer_ros.estimates import NormalisedInnovation, Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.observer.step import DONE, REJECTS
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import (
     corrected,
     enter,
+    Expected,
     is_contradiction,
     keyframe_of,
     point_covariances,
     positions,
 )
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.usual import Corrected, NO_IDS, Outcome
+from slam_observer_ros.state.usual import Corrected, NO_IDS
 
 
-def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> Outcome | None:
-    """Let a state use an observation (28)–(31) made at its instant; ``is_weighed`` as to correct.
+def observe(
+    state: State, event: ObservationEvent, is_weighed: bool = False
+) -> tuple[Update, Expected | None] | None:
+    """Let a state use an observation (28)–(31) made at its instant.
 
-    Return None, with nothing changed, where the usual step is not possible.
+    Return what that did, and what was expected of the points used, if the observation
+    ``is_weighed``. Return None, with nothing changed, where the usual step is not possible.
     """
     rows = state.landmarks.rows_of(event.ids)
     known = rows >= 0
@@ -40,7 +44,7 @@ def observe(state: State, event: ObservationEvent, is_weighed: bool = False) -> 
     if of_all is None:
         return None
     if of_all.status == DONE:  # as nearly always
-        return usual.whole(state, event, of_all)
+        return usual.whole(state, event, of_all), usual.expected(state, of_all.out)
     return _in_parts(state, event, rows, known, of_all, is_weighed)
 
 
@@ -51,7 +55,7 @@ def _in_parts(
     known: BoolArray,
     of_all: Corrected | None,
     is_weighed: bool,
-) -> Outcome | None:
+) -> tuple[Update, Expected | None] | None:
     """Use the points of ``known`` (m,) landmarks, as far as they are not rejected.
 
     ``of_all`` is what the kernel made of them, if it was asked already.
@@ -82,7 +86,8 @@ def _in_parts(
     past = state.relinearisation
     if past.is_active:
         past.add(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)), in_doubt=False)
-    return _outcome(state, event.ids[known], rejected[known], of_all, of_used)
+    expected = None if of_used is None else usual.expected(state, of_used.out)
+    return _update(state, event, known, rejected[known], of_all, of_used), expected
 
 
 def _may_enter(state: State, new_ids: IntArray) -> bool:
@@ -99,27 +104,29 @@ def _may_enter(state: State, new_ids: IntArray) -> bool:
 
 
 def _may_leave_out(state: State, rows: IntArray, rejected: BoolArray) -> bool:
-    """Return whether a few of the points (m,) are rejected, and their landmarks not yet in doubt.
+    """Return whether few of the points (m,) are rejected, and no landmark becomes doubtful by it.
 
-    They are ``rejected`` once more then.
+    The ``rejected`` ones are counted as such once more.
     """
     most = state.settings.max_rejections
     in_doubt = state.landmarks.in_doubt(rows[rejected], most, further=1)
     return not np.count_nonzero(in_doubt) and not is_contradiction(rejected)
 
 
-def _outcome(
+def _update(
     state: State,
-    ids: IntArray,
+    event: ObservationEvent,
+    known: BoolArray,
     rejected: BoolArray,
     of_all: Corrected | None,
     of_used: Corrected | None,
-) -> Outcome:
-    """Return what points of known landmarks (m,) say, of which some are ``rejected`` (m,)."""
+) -> Update:
+    """Return what an observation did; of its ``known`` landmarks some are ``rejected`` (m,)."""
+    ids, stamp_ns = event.ids[known], event.stamp_ns
     if of_all is None or of_used is None:
         judges, none = state.judges_innovations, np.empty(0)
         nothing = NormalisedInnovation(none, none, None, 0, none, none) if judges else None
-        return Outcome(ids, np.empty((0, 3)), rejected, NO_IDS, nothing)
+        return state.update(stamp_ns, ids, np.empty((0, 3)), rejected, NO_IDS, nothing)
     innovation = usual.innovation(state, of_used.out)
     if innovation is not None and of_used is not of_all:
         distances, _, shares = of_all.out.judged[:-1].reshape(3, -1)
@@ -136,6 +143,4 @@ def _outcome(
             log_densities,
             shares,
         )
-    return Outcome(
-        ids, of_all.out.r, rejected, NO_IDS, innovation, usual.expected(state, of_used.out)
-    )
+    return state.update(stamp_ns, ids, of_all.out.r, rejected, NO_IDS, innovation)

@@ -1,4 +1,4 @@
-"""One hypothesis of pose and map: gains, what is known of errors, landmarks, and history."""
+"""One hypothesis of pose and map: gains, errors, landmarks and history."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from copy import copy
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import NormalisedInnovation, Smoothed, Update
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
+from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.observer.gains import Errors, Gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
@@ -30,7 +31,7 @@ class State:
         self.settings = settings  # those in force
         self.judges_innovations = False  # which takes time, and is for those who look at them
         self.is_mapping = True  # landmarks are added, and relocated if rejected too often
-        self.gains, self.errors = gains, gains.errors  # what moves X̂, what is known of its errors
+        self.gains, self.errors = gains, gains.errors  # they move X̂, and know its errors or not
         self.observer, self.axes = gains.observer, gains.axes
         self.calibration, self.motion_noise = gains.calibration, gains.motion_noise
         self.landmarks = self.observer.landmarks
@@ -59,7 +60,7 @@ class State:
 
     @property
     def known_errors(self) -> Errors:
-        """What is known of the errors, where association asks, which needs that."""
+        """The errors, for association, which only gains that know them have."""
         if self.errors is None:
             raise TypeError('these gains know no joint covariance')
         return self.errors
@@ -152,6 +153,28 @@ class State:
         self.relinearisation.move(motion)
         if motion.at_ends is not None:
             self._end_velocity = motion.at_ends[1]
+
+    def update(
+        self,
+        stamp_ns: int,
+        ids: IntArray,
+        r: FloatArray,
+        rejected: BoolArray,
+        moved_ids: IntArray,
+        innovation: NormalisedInnovation | None,
+    ) -> Update:
+        """Return what an observation of m landmarks has done, given residuals r (m, 3) before."""
+        observer = self.observer
+        return Update(
+            stamp_ns,
+            observer.pose,
+            ids,
+            se3.rotate(observer.reference_pose, r),
+            rejected,
+            lyapunov(self.settings.gain_k, r),
+            moved_ids,
+            innovation,
+        )
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot to ``pose`` (4, 4), body to world, uncorrelated with the map from now on.

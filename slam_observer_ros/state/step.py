@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.observer import Residuals
@@ -30,10 +31,9 @@ from slam_observer_ros.state.matching import (
     sensitivity,
 )
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.usual import Outcome
 
 
-def step(state: State, matched: MatchedObservation) -> Outcome:
+def step(state: State, matched: MatchedObservation) -> Update:
     """One step of the observer (28), from where the velocity has led it (27): the innovation."""
     matched = correct_by_orientations(state, matched)  # φ_i = log(R_Â Z_i B̂_iᵀ)
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
@@ -50,7 +50,8 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     if expected is not None:
         repeated = repetition_factors(residuals.dt_s, state.observation_noise.error_time_s)
         innovation = expected.judge(weights, 1.0 / repeated)
-    return Outcome(matched.known.ids, residuals.r, rejected, moved_ids, innovation)
+    ids, stamp_ns = matched.known.ids, matched.event.stamp_ns
+    return state.update(stamp_ns, ids, residuals.r, rejected, moved_ids, innovation)
 
 
 def _correct(state: State, residuals: Residuals) -> FloatArray:

@@ -1,20 +1,19 @@
-"""Where the usual step reads the arrays of a state, and a state takes over what that did.
+"""The usual step over the arrays of a state, which takes over the results.
 
-Both return None, with no estimate changed, where anything is unusual: see :mod:`.observer.step`.
-Of large maps only those landmarks are read that are active, which those seen are by then.
+All returns None, with no estimate changed, where anything is unusual: see :mod:`.observer.step`.
+Of a large map only active landmarks are read; the landmarks seen have become active before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import NormalisedInnovation
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import NormalisedInnovation, Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis
 from slam_observer_ros.geometry.sensor_mounting import Sensed
@@ -42,18 +41,6 @@ MOST_WORK = 1e7
 """Multiplications of a correction of P beyond which BLAS, in the general way, takes less time."""
 
 _NO_ENTRIES, NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What an observation did to a state."""
-
-    ids: IntArray  # (m,) ids of the landmarks seen that were known before
-    residuals: FloatArray  # (m, 3) before the correction, metres, reference frame
-    rejected: BoolArray  # (m,) which of them were too far off to be used
-    moved_ids: IntArray  # ids of landmarks that it showed to have moved
-    innovation: NormalisedInnovation | None = None
-    expected: Expected | None = None  # of those that were used, if it was asked for
 
 
 def advance(
@@ -104,7 +91,7 @@ def _led_to(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return Â (s, 4, 4) and covariances (s, 6, 6) of ε to which :func:`advance` would lead.
 
-    Until each instant along what is known of velocities then.
+    Until each instant along the velocities known then.
     """
     errors, axes = state.errors, state.axes
     if errors is None or core.COMPILED is None:  # in numpy the general way costs less
@@ -132,34 +119,29 @@ def _in_world(
 
 
 class Corrected(NamedTuple):
-    """What the kernel made of points of known landmarks."""
+    """Points of known landmarks as the kernel was given them, and its results."""
 
     status: int  # DONE, or REJECTS: then nothing has changed
     rows: IntArray  # (m,) which landmarks
     seen: Seen
     out: Observed
-    factors: Factors | None  # what was learnt of the noise of the motion
+    factors: Factors | None  # as learnt of the noise of the motion
 
 
-def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Outcome:
-    """Keep a keyframe of an observation all of which has corrected a state; return its outcome."""
+def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Update:
+    """Keep a keyframe of an observation that has corrected a state by all its points."""
     past, out = state.relinearisation, corrected.out
     if past.is_active:
         past.add(keyframe(state, event, corrected), in_doubt=False)
-    return Outcome(
-        event.ids,
-        out.r,
-        np.zeros(len(event.ids), dtype=np.bool_),
-        NO_IDS,
-        innovation(state, out),
-        expected(state, out),
-    )
+    none_rejected = np.zeros(len(event.ids), dtype=np.bool_)
+    judged = innovation(state, out)
+    return state.update(event.stamp_ns, event.ids, out.r, none_rejected, NO_IDS, judged)
 
 
 def takes(state: State, event: ObservationEvent) -> bool:
-    """Return whether a state is a map of points at rest, and an observation of points alone.
+    """Return whether a state is a map of points at rest, and the observation has points alone.
 
-    Made at the state's instant, by a sensor that is known.
+    It must be of the state's instant, by a sensor that is known.
     """
     calibration, joint = state.calibration, _at_rest(state)
     return (
@@ -179,10 +161,10 @@ def correct(
     is_weighed: bool = False,
     of_all: Corrected | None = None,
 ) -> Corrected | None:
-    """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe of it.
+    """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe.
 
-    Of an observation that it :func:`takes`; of one ``of_all`` whose other points were rejected.
-    ``is_weighed`` asks what was expected of the points, too.
+    The observation is one that the state :func:`takes`, or the part of one that ``of_all`` has not
+    rejected. If it ``is_weighed``, the results have what was expected of the points.
     """
     m, k, joint = len(rows), state.axes.point, state.known_errors.joint
     if not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
@@ -242,7 +224,7 @@ def _at_rest(state: State) -> JointCovariance | None:
 
 
 def _estimate(state: State, joint: JointCovariance) -> Estimate:
-    """Return what is estimated as plain arrays, of landmarks :func:`_at_rest`."""
+    """Return the estimate as plain arrays, of landmarks :func:`_at_rest`."""
     observer, matrix, active = state.observer, joint._matrix, joint.active
     return _estimate_of(
         state,
@@ -334,7 +316,7 @@ def _plain(array: FloatArray) -> FloatArray:
 
 
 def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Keyframe:
-    """Return what is needed to linearise again what was seen."""
+    """Return the points as they are kept to be linearised again."""
     seen, out, sensed = corrected.seen, corrected.out, None
     if seen.sensor is not None:
         number = state.calibration.sensors.index(event.sensor_frame)

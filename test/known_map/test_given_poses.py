@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.stats import chi2
 
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -20,7 +21,6 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.localiser import CONFIRMING_VOTES, PoseTrial
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.step import Outcome
 
 
 @pytest.mark.parametrize('mode', MODES)
@@ -61,8 +61,8 @@ def votes(known, often):
 
     def is_contradicted(by_all, seen=ids):
         rejected = np.full(len(seen), by_all)
-        outcome = Outcome(seen, np.zeros((len(seen), 3)), rejected, ids[:0])
-        return trial.vote(outcome, often)
+        update = Update(0, np.eye(4), seen, np.zeros((len(seen), 3)), rejected, 0.0, ids[:0])
+        return trial.vote(update, often)
 
     return is_contradicted
 

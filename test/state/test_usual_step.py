@@ -130,30 +130,31 @@ class BothWays:
     def observe(self, state, event, is_weighed=False):
         other = state.copy()
         self.observed += 1
-        outcome = self._observe(state, event, is_weighed)
-        if outcome is None:
+        used = self._observe(state, event, is_weighed)
+        if used is None:
             assert_same(state, other, 'an unusual observation')
             return None
-        is_whole = 0 < len(outcome.ids) == len(event.ids) and not outcome.rejected.any()
+        update, weighed = used
+        is_whole = 0 < len(update.ids) == len(event.ids) and not update.rejected.any()
         self.used[usual if is_whole else in_parts] += 1
         matched = match(other, event)
         if is_weighed:
-            cost = as_its_ids_say(state, event, outcome).cost
+            cost = as_its_ids_say(state, event, update, weighed).cost
             assert cost == pytest.approx(pairing_cost(other, len(event.ids), matched.residuals))
         expected = step(other, matched)
         assert_same(state, other, f'the observation at {event.stamp_ns}')
         assert state.counts == other.counts
-        np.testing.assert_array_equal(outcome.ids, expected.ids)
-        np.testing.assert_allclose(outcome.residuals, expected.residuals, atol=1e-12)
-        np.testing.assert_array_equal(outcome.rejected, expected.rejected)
-        self.entered += len(outcome.ids) < len(event.ids)
+        np.testing.assert_array_equal(update.ids, expected.ids)
+        np.testing.assert_allclose(update.residuals, expected.residuals, atol=1e-12)
+        np.testing.assert_array_equal(update.rejected, expected.rejected)
+        self.entered += len(update.ids) < len(event.ids)
         self.rejected += bool(expected.rejected.any())
         for name in ('distances', 'weights', 'log_densities', 'shares'):
-            one, two = (getattr(o.innovation, name) for o in (outcome, expected))
+            one, two = (getattr(o.innovation, name) for o in (update, expected))
             np.testing.assert_allclose(one, two, rtol=1e-8, atol=1e-9, err_msg=name)
-        assert outcome.innovation.nis == pytest.approx(expected.innovation.nis)
-        assert outcome.innovation.degrees_of_freedom == expected.innovation.degrees_of_freedom
-        return outcome
+        assert update.innovation.nis == pytest.approx(expected.innovation.nis)
+        assert update.innovation.degrees_of_freedom == expected.innovation.degrees_of_freedom
+        return used
 
 
 def ask_for_poses(estimator):

@@ -144,7 +144,7 @@ class OrientationGains(Gains):
     def _judge_flips(
         self, seen: SeenOrientations, phi: FloatArray, predicted: FloatArray, R: FloatArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Return which (m,) are flipped, and of which that is unclear."""
+        """Return which orientations (m,) are flipped, and which may be."""
         twins = self._turns(seen.rows, seen.flipped)
         evidence = distances(twins, predicted, R) ** 2 - distances(phi, predicted, R) ** 2
         R_hat = self.observer.A[:3, :3]
@@ -152,13 +152,13 @@ class OrientationGains(Gains):
         return flip_verdicts(evidence, distances(apart, np.zeros_like(predicted), R))
 
     def take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
-        """Take in what a map knows of the orientations of landmarks ``rows`` (m,)."""
+        """Take in orientations of landmarks ``rows`` (m,) that a map knows."""
         tags, R, sigmas = known.tags, known.orientations, known.sigmas
         if R is None or sigmas is None or self.tags is None:
             return
         if known.joint is None:
             self.know_orientations(rows[tags], R[tags], sigmas[tags])
-        else:  # their errors have been taken in with those of the positions
+        else:  # their errors have been taken in together with those of positions
             seen = self._settings.max_rejections
             self.observer.orientations.put_known(rows[tags], R[tags], sigmas[tags], seen)
 
