@@ -14,6 +14,8 @@ PIP_LIMITS := $(if $(ROS_WHEELS),,--constraint constraints.txt)
 # where ament_index finds the wheels' packages
 export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 endif
+# without bytecode each of the hundreds of programs that tests start compiles the package anew
+export PYTHONDONTWRITEBYTECODE :=
 ifdef _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # make was started by a Python with ROS wheels of its own, whose libraries must not be used here
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
@@ -35,7 +37,9 @@ demo: $(READY) $(CORE)  ## run simulator and observer until they converge; pictu
 robot: $(READY) $(CORE)  ## localise a simulated robot among AprilTags, as for Nav2; OPTIONS=--help
 	$(PYTHON_IN_VENV) demo/robot.py $(OPTIONS)
 
-test: lint pytest colcon  ## everything that a change must pass
+test: $(READY_TO_DEVELOP) $(CORE)  ## everything that a change must pass
+	$(MAKE) --jobs=2 lint colcon
+	$(MAKE) pytest
 
 lint: $(READY_TO_DEVELOP)  ## ruff, mypy --strict, the layers of the architecture
 	$(VENV)/bin/ruff check --no-cache

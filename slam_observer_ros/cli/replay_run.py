@@ -20,8 +20,8 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.input_health import of_use
-from slam_observer_ros.runs.replay import Replay, replay
-from slam_observer_ros.runs.reported_run import NisTally, RunRecorder
+from slam_observer_ros.runs.replay import replay
+from slam_observer_ros.runs.reported_run import NisTally, Replay, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -133,14 +133,14 @@ class Localiser:
             return None
         reason = None
         if self._trial is not None and self._trial.vote(update, state.settings.max_rejections):
-            reason = 'Most landmarks contradict the pose that was given'
+            reason = 'most landmarks contradict the pose that was given'
             if self._tag is not None:
-                reason = f'Most landmarks contradict the pose that tag {self._tag} gave'
+                reason = f'most landmarks contradict the pose that tag {self._tag} gave'
                 self._refused.add(self._tag)
         elif self.is_localised and is_lost(state):
-            reason = 'All landmarks are far from where they should be'
+            reason = 'all landmarks are far from where they should be'
         elif self.is_localised and self._unexplained.is_too_much(state, event, missed):
-            reason = 'Most of what is seen is not in the map'
+            reason = 'most of what is seen is not in the map'
         self.counts['lost'] += reason is not None
         return reason
 

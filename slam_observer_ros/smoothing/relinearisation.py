@@ -25,6 +25,7 @@ from typing import Protocol
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError, SmoothingError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
@@ -458,8 +459,4 @@ class _Warning:
         if self._is_given:
             return
         self._is_given = True
-        logger.warning(
-            'Could not relinearise (said only once): the observations so far leave something '
-            'open, as where covariances are so large that they say nothing. Odometry often has '
-            'such for z, roll and pitch: set two_d_mode: true for a robot on a floor.'
-        )
+        logger.warning('%s', found('not_relinearised'))
