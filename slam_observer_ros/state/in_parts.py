@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, IntArray
+from slam_observer_ros.common.types import BoolArray, IntArray, is_automatic
 from slam_observer_ros.estimates import NormalisedInnovation, Update
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.observer.step import DONE, REJECTS
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import (
@@ -82,7 +82,7 @@ def _in_parts(
     if len(new.ids):
         enter(state, new, state.observation_noise.covariances(new))
     past = state.relinearisation
-    if past is not None and past.is_active:
+    if past.is_active:
         past.add(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)), in_doubt=False)
     expected = None if of_used is None else usual.expected(state, of_used.out)
     return _update(state, event, known, rejected[known], of_all, of_used), expected
