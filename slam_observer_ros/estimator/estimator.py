@@ -359,8 +359,7 @@ class Estimator(Estimate):
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
-        is_dense = state.joint is not None and state.joint.is_dense
-        warnings.large_map(len(state.landmarks), limit, is_dense)
+        warnings.large_map(len(state.landmarks), limit, state.gains)
 
     def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""

@@ -54,14 +54,11 @@ class EventWarnings:
         if count >= MANY_POINTS:
             self._warn_once('many_points', count=count)
 
-    def large_map(self, count: int, limit: int, is_dense: bool) -> None:
-        """Say once that a map is full, with 0 < ``limit``, and once that it takes long.
-
-        That is where a joint covariance has all landmarks in it.
-        """
+    def large_map(self, count: int, limit: int, gains: Gains) -> None:
+        """Say once that a map is full, with 0 < ``limit``, and that its ``gains`` take long."""
         if 0 < limit <= count:
             self._warn_once('full_map', count=count, limit=limit)
-        if is_dense and count >= MANY_LANDMARKS:
+        if count >= MANY_LANDMARKS and gains.takes_all:
             self._warn_once('large_map', count=count)
 
     def loaded_map(self, count: int, limit: int) -> None:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, is_automatic
 from slam_observer_ros.estimates import Update
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import pose_by_tag, TagPose
 from slam_observer_ros.known_map.merging import enter_map, start_in_map

@@ -19,7 +19,7 @@ from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import Smoothed, Update
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
@@ -30,7 +30,6 @@ from slam_observer_ros.evaluation.metrics import (
     TrajectoryErrors,
 )
 from slam_observer_ros.evaluation.trajectory import filled, Trajectory
-from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.sensor_models.calibration import (

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from slam_observer_ros.common.stamps import is_due, NANOSECONDS_PER_SECOND
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import LandmarkTruth
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.messages.estimate_messages import (
     encode_transform,
     EstimateMessages,
