@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
+import inspect
+import io
 import logging
 from pathlib import Path
 import sys
+from tempfile import TemporaryDirectory
 from types import FrameType
 
 import worlds
 
+from slam_observer_ros.cli.main import main as command_line
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -47,6 +52,7 @@ def main() -> None:
     chain, step = longest_chain(), traced_step()
     docstrings, lines = docstring_lines()
     rows = {
+        'modules': len(modules()),
         'loose modules at the top': len(loose_modules()),
         'layers': layers(),
         'longest import chain': f'{len(chain)}: {" > ".join(chain)}',
@@ -55,6 +61,7 @@ def main() -> None:
         'traced step, changes of module': step.changes,
         'traced step, depth': step.depth,
         'traced velocity, functions called': traced_velocity().functions,
+        'modules entered by replay --report': len(entered_by_a_report()),
         'lines': lines,
         'share of docstrings': f'{docstrings / lines:.1%}',
     }
@@ -146,6 +153,26 @@ def _traced_kind(kind: type[Event], settings: Settings | None = None) -> TracedS
         observed += isinstance(event, ObservationEvent)
         estimator.add(event)
     raise ValueError('the world has too few observations')
+
+
+def entered_by_a_report() -> set[str]:
+    """Return the modules in which a function is called by ``replay --report`` of the sample."""
+    entered: set[str] = set()
+
+    def note(frame: FrameType, kind: str, _argument: object) -> None:
+        path = frame.f_code.co_filename
+        is_function = frame.f_code.co_flags & inspect.CO_OPTIMIZED  # and no class's body
+        if kind == 'call' and is_function and str(PACKAGE) in path:
+            entered.add(path.removeprefix(f'{PACKAGE}/').removesuffix('.py'))
+
+    with TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
+        sample, report = worlds.CHECKOUT / 'samples' / 'sample.mcap', Path(folder) / 'report.html'
+        sys.setprofile(note)
+        try:
+            command_line(['replay', str(sample), '--report', str(report)])
+        finally:
+            sys.setprofile(None)
+    return entered
 
 
 def _traced(estimator: Estimator, event: ObservationEvent) -> TracedStep:

@@ -30,12 +30,6 @@ IMPOSSIBLE_ID = -(2**31)
 MAX_ID = 2**32 - 2
 """Largest landmark id: they go out as uint32, whose last one says that it is unknown."""
 
-FIRST_AUTOMATIC_ID = 10_000_000
-"""Landmarks whose sensor gives no ids are numbered from here on."""
-
-LAST_AUTOMATIC_ID = 2**24 - 1
-"""They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
-
 
 @dataclass(frozen=True, slots=True)
 class VelocityEvent:
@@ -217,12 +211,6 @@ MeasuredVelocity: TypeAlias = VelocityEvent | VelocityBlock | AngularVelocityEve
 
 Queued: TypeAlias = MeasuredVelocity | ObservationEvent
 """An event as it is put in order of stamps, and then used."""
-
-
-def is_automatic(ids: IntArray) -> BoolArray:
-    """Return which ids (m,) were given to landmarks whose sensor gives none."""
-    automatic: BoolArray = (ids >= FIRST_AUTOMATIC_ID) & (ids <= LAST_AUTOMATIC_ID)
-    return automatic
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:

@@ -25,8 +25,8 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import (
@@ -36,9 +36,9 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
+from slam_observer_ros.observer.landmark_table import MIN_LOOP
 from slam_observer_ros.observer.observer import Observer, Residuals
 from slam_observer_ros.observer.robust import accepted
-from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.matching import sensitivity
 from slam_observer_ros.state.state import State
 

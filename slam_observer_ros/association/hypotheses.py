@@ -33,14 +33,9 @@ from slam_observer_ros.association.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, Update
-from slam_observer_ros.events import (
-    FIRST_AUTOMATIC_ID,
-    is_automatic,
-    ObservationEvent,
-    UNKNOWN_ID,
-)
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.integration import DelayEvidence
@@ -79,6 +74,8 @@ class Hypotheses:
 
     def _start(self, state: State) -> None:
         self._all = [Hypothesis.of(state)]
+        # Else points have ids, and are what these say.
+        self._can_weigh = state.errors is not None
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
@@ -232,7 +229,7 @@ class Hypotheses:
     def _judge(self, event: ObservationEvent) -> None:
         """Stop where the wheels spin, and give up landmarks that the robot carries."""
         standing, best = self._standing, self.best
-        if best.errors is None or self._velocities is None:
+        if not self._can_weigh or self._velocities is None:
             return
         was_slipping, were_carried = standing.slip is not None, standing.carried
         lost = standing.note(best, event, self._velocities)
@@ -256,7 +253,7 @@ class Hypotheses:
             return used[0]
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        if self.best.errors is None:
+        if not self._can_weigh:
             return self._observe_alone(event)
         matched = match(self.best, event) if len(self._all) == 1 else None
         if matched is not None and not unknown:

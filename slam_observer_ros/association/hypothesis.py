@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import is_automatic, ObservationEvent
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.state.landmark_table import LandmarkTable
+from slam_observer_ros.observer.landmark_table import LandmarkTable
 from slam_observer_ros.state.state import State
 
 MAX_LOOSE = 256

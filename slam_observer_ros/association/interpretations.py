@@ -27,9 +27,9 @@ from slam_observer_ros.association.costs import (
 )
 from slam_observer_ros.association.hypothesis import LandmarkIndex, Verdicts
 from slam_observer_ros.association.joint_compatibility import joint_cost
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import Update
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, are_far, far_from_the_others

@@ -26,7 +26,7 @@ from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.opening import sha256_of
 from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, figure_text
 from slam_observer_ros.runs.input_health import list_dropped
-from slam_observer_ros.runs.replay import Replay
+from slam_observer_ros.runs.reported_run import Replay
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names
 

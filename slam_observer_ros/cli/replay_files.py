@@ -30,7 +30,7 @@ from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.map_file import map_files, write_map
 from slam_observer_ros.recording.opening import files_of
-from slam_observer_ros.runs.replay import Replay
+from slam_observer_ros.runs.reported_run import Replay
 
 logger = logging.getLogger(__name__)
 

@@ -36,8 +36,7 @@ from slam_observer_ros.runs.health import (
     of_rejections,
 )
 from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
-from slam_observer_ros.runs.replay import Replay
-from slam_observer_ros.runs.reported_run import NisTally, ReportedRun, RunRecorder
+from slam_observer_ros.runs.reported_run import NisTally, Replay, ReportedRun, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)

@@ -14,14 +14,14 @@ from slam_observer_ros.cli.replay_outcome import judged, outcome_of, ReplayOutco
 from slam_observer_ros.cli.replay_request import Records, ReplayRequest, select_inputs
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import Finding
+from slam_observer_ros.common.types import is_automatic
 from slam_observer_ros.estimates import UNUSED_POINTS
-from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.input_health import of_use
-from slam_observer_ros.runs.replay import Replay, replay
-from slam_observer_ros.runs.reported_run import NisTally, RunRecorder
+from slam_observer_ros.runs.replay import replay
+from slam_observer_ros.runs.reported_run import NisTally, Replay, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -110,7 +110,7 @@ KINDS = {
         Level.WARNING,
         'trajectory, map, errors and figures are only of the {seconds:.1f} s after the last jump '
         'of the clock ({count} in all)',
-        'record with one clock, or set on_time_jump: keep',
+        'record with one clock, or set on_time_jump: hold',
     ),
     # The recording
     'damaged': Kind(
@@ -306,7 +306,53 @@ KINDS = {
         'was moved, or it is in the map twice now',
         'if it was not moved, state more noise of the velocity or of the points (Tune the noise)',
     ),
+    'wrong_pose': Kind(
+        Level.WARNING, 'the pose in the map is wrong: {reason}; localising again', GIVE_THE_POSE
+    ),
+    'diverged': Kind(
+        Level.ERROR,
+        'the estimate has diverged: the pose is {distance_m:.1e} m from its origin; it starts '
+        'again',
+        'look at the noise of velocities and landmarks: it may be set orders of magnitude wrong',
+    ),
+    'clock_reset': Kind(
+        Level.WARNING,
+        'the clock has jumped{way}: starting again',
+        'set on_time_jump: hold to keep pose and map',
+    ),
+    'clock_held': Kind(
+        Level.WARNING,
+        'the clock has jumped{way}: pose and map are held',
+        'look for a wrong clock if no recording was started again',
+    ),
+    'not_relinearised': Kind(
+        Level.WARNING,
+        'could not relinearise (said only once): the observations so far leave something open, as '
+        'where covariances are so large that they say nothing; odometry often has such for z, '
+        'roll and pitch',
+        'set two_d_mode: true for a robot on a floor',
+    ),
+    # Settings
+    'ignored_settings': Kind(
+        Level.WARNING,
+        'no effect on {gains} gains: {names}',
+        'do without them, or use other gains',
+    ),
+    'ignored_orientations': Kind(
+        Level.WARNING,
+        'no effect of use_tag_orientation with landmark_velocity_stddev: landmarks are points '
+        'that move',
+        'set landmark_velocity_stddev: 0.0 for tags at rest',
+    ),
+    'ignored_start': Kind(
+        Level.WARNING,
+        'no effect of initial_position and initial_yaw',
+        'use set_initial_pose: true',
+    ),
     # A loaded map
+    'left_out_of_table': Kind(
+        Level.WARNING, '{path}: left out: {columns}', 'see whether the map needs any of it'
+    ),
     'flat_map': Kind(
         Level.WARNING,
         'the map was made with two_d_mode, which is off: in space its heights of zero are taken '

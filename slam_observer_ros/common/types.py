@@ -1,4 +1,4 @@
-"""Arrays: their types, and columns with a row for each landmark."""
+"""Arrays: their types, columns with a row for each landmark, and the numbers of these."""
 
 from __future__ import annotations
 
@@ -21,6 +21,12 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 """Array of bool: masks over landmarks."""
 
+
+FIRST_AUTOMATIC_ID = 10_000_000
+"""Landmarks whose sensor gives no ids are numbered from here on."""
+
+LAST_AUTOMATIC_ID = 2**24 - 1
+"""They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
 
 LEAST_ROOM = 16
 """Rows for which there is room at first."""
@@ -87,3 +93,9 @@ class LandmarkColumns:
         self._count = count
         for name, store in self._stores.items():
             setattr(self, name, store[:count])
+
+
+def is_automatic(ids: IntArray) -> BoolArray:
+    """Return which ids (m,) were given to landmarks whose sensor gives none."""
+    automatic: BoolArray = (ids >= FIRST_AUTOMATIC_ID) & (ids <= LAST_AUTOMATIC_ID)
+    return automatic

@@ -10,16 +10,20 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import (
+    BoolArray,
+    FIRST_AUTOMATIC_ID,
+    FloatArray,
+    IntArray,
+    is_automatic,
+    LAST_AUTOMATIC_ID,
+)
 from slam_observer_ros.estimator.event_warnings import EventWarnings, listed
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
-    FIRST_AUTOMATIC_ID,
     flatten,
     IMPOSSIBLE_ID,
-    is_automatic,
-    LAST_AUTOMATIC_ID,
     MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,
@@ -31,8 +35,8 @@ from slam_observer_ros.geometry.matrices import are_covariances, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
 from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.observer.landmark_table import LandmarkTable
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
-from slam_observer_ros.state.landmark_table import LandmarkTable
 
 ROTATION_TOLERANCE = 1e-3
 """How far RᵀR of a pose may be from identity: much further than single precision puts it."""

@@ -11,6 +11,7 @@ import time
 import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Update
@@ -107,13 +108,10 @@ class Estimator(Estimate):
         # Events of before the jump that are held back are used first.
         self.release()
         if self.settings.on_time_jump == 'reset':
-            logger.warning(
-                'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
-                way,
-            )
+            logger.warning('%s', found('clock_reset', way=way))
             self.reset(None if self._localiser.maps else self._start_pose)
         else:
-            logger.warning('The clock has jumped%s; pose and map are held.', way)
+            logger.warning('%s', found('clock_held', way=way))
             self._timeline.catch_up()
             self._report_stamp()
             self._hypotheses.clear_time()
@@ -346,11 +344,7 @@ class Estimator(Estimate):
 
     def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""
-        logger.error(
-            'The estimate has diverged: the pose is %.1e m from its origin. Starting again; the '
-            'noise of velocities and landmarks may be set orders of magnitude wrong.',
-            distance_m,
-        )
+        logger.error('%s', found('diverged', distance_m=distance_m))
         self._counts['diverged'] += 1
         self._placement.start(None)
 
@@ -365,8 +359,7 @@ class Estimator(Estimate):
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
-        is_dense = state.joint is not None and state.joint.is_dense
-        warnings.large_map(len(state.landmarks), limit, is_dense)
+        warnings.large_map(len(state.landmarks), limit, state.gains)
 
     def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""

@@ -54,14 +54,11 @@ class EventWarnings:
         if count >= MANY_POINTS:
             self._warn_once('many_points', count=count)
 
-    def large_map(self, count: int, limit: int, is_dense: bool) -> None:
-        """Say once that a map is full, with 0 < ``limit``, and once that it takes long.
-
-        That is where a joint covariance has all landmarks in it.
-        """
+    def large_map(self, count: int, limit: int, gains: Gains) -> None:
+        """Say once that a map is full, with 0 < ``limit``, and that its ``gains`` take long."""
         if 0 < limit <= count:
             self._warn_once('full_map', count=count, limit=limit)
-        if is_dense and count >= MANY_LANDMARKS:
+        if count >= MANY_LANDMARKS and gains.takes_all:
             self._warn_once('large_map', count=count)
 
     def loaded_map(self, count: int, limit: int) -> None:
@@ -97,18 +94,14 @@ class EventWarnings:
         """Name settings that have been changed and have no effect."""
         changed = set(changed_names(settings))
         if unused := [name for name in gains.ignores if name in changed]:
-            logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
+            names = ', '.join(unused)
+            logger.warning('%s', found('ignored_settings', gains=settings.gains, names=names))
         is_ignored = 'use_tag_orientation' in gains.ignores
         if settings.use_tag_orientation and gains.tags is None and not is_ignored:
-            logger.warning(
-                'use_tag_orientation has no effect with landmark_velocity_stddev: landmarks are '
-                'points that move (set landmark_velocity_stddev: 0.0 for tags at rest).'
-            )
+            logger.warning('%s', found('ignored_orientations'))
         is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
         if is_given and not settings.set_initial_pose:
-            logger.warning(
-                'initial_position and initial_yaw have no effect (use set_initial_pose: true).'
-            )
+            logger.warning('%s', found('ignored_start'))
 
     def _warn_once(self, kind: str, **figures: object) -> None:
         self._counts[kind] += 1

@@ -8,6 +8,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent
@@ -92,13 +93,13 @@ class Placement:
         missed = hypotheses.missed
         reason = localiser.reason_to_reset(hypotheses.best, event, update, missed)
         if reason is not None:
-            logger.warning('%s; localising again.', reason)
+            logger.warning('%s', found('wrong_pose', reason=reason))
             self.start(None)
         if localiser.search(hypotheses.best):
             hypotheses.prune_to_best()
-        elif (found := localiser.pose_by_tag(hypotheses.best)) is not None:
-            self.start(found.pose, found.covariance, found.known)
-            localiser.try_tag(found.tag_id)
+        elif (by_tag := localiser.pose_by_tag(hypotheses.best)) is not None:
+            self.start(by_tag.pose, by_tag.covariance, by_tag.known)
+            localiser.try_tag(by_tag.tag_id)
 
     def start(
         self,

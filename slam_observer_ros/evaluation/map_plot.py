@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.evaluation.consistency import CHI_SQUARE_95, outlines
 from slam_observer_ros.evaluation.drawing import (
     BLACK,
@@ -35,7 +35,6 @@ from slam_observer_ros.evaluation.drawing import (
 )
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import LandmarkTruth, Trajectory
-from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 
 _MAX_LABELS = 300

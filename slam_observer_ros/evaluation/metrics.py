@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.evaluation.trajectory import (
     associate,
     is_sparse,
@@ -21,7 +21,6 @@ from slam_observer_ros.evaluation.trajectory import (
     MAX_GAP_NS,
     Trajectory,
 )
-from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.geometry.se3 import rigid_alignment

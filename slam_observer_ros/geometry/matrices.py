@@ -211,7 +211,8 @@ def _have_roots(covariances: FloatArray) -> bool:
             return False
         covariances = covariances + exact[..., None] * np.eye(exact.shape[-1])
     least = covariances.diagonal(axis1=-2, axis2=-1).min(initial=1.0)
-    skew = np.abs(covariances - transpose(covariances)).max(initial=0.0)
+    with np.errstate(over='ignore'):
+        skew = np.abs(covariances - transpose(covariances)).max(initial=0.0)
     if skew > COVARIANCE_ROUNDING * least:
         return False
     with suppress(np.linalg.LinAlgError):

@@ -11,8 +11,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.known_map.constellation import find_places, MAX_LOOKS
 from slam_observer_ros.known_map.landmark_map import LandmarkMap, MappedLandmarks
 from slam_observer_ros.known_map.map_check import place_for_another, symmetries

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, is_automatic
 from slam_observer_ros.estimates import Update
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import pose_by_tag, TagPose
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
@@ -133,14 +133,14 @@ class Localiser:
             return None
         reason = None
         if self._trial is not None and self._trial.vote(update, state.settings.max_rejections):
-            reason = 'Most landmarks contradict the pose that was given'
+            reason = 'most landmarks contradict the pose that was given'
             if self._tag is not None:
-                reason = f'Most landmarks contradict the pose that tag {self._tag} gave'
+                reason = f'most landmarks contradict the pose that tag {self._tag} gave'
                 self._refused.add(self._tag)
         elif self.is_localised and is_lost(state):
-            reason = 'All landmarks are far from where they should be'
+            reason = 'all landmarks are far from where they should be'
         elif self.is_localised and self._unexplained.is_too_much(state, event, missed):
-            reason = 'Most of what is seen is not in the map'
+            reason = 'most of what is seen is not in the map'
         self.counts['lost'] += reason is not None
         return reason
 

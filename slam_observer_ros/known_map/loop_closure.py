@@ -14,11 +14,10 @@ import math
 import numpy as np
 from scipy.linalg import cholesky
 
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.known_map.merging import without_frame
-from slam_observer_ros.state.landmark_table import MIN_LOOP
+from slam_observer_ros.observer.landmark_table import MIN_LOOP
 from slam_observer_ros.state.state import State
 
 logger = logging.getLogger(__name__)

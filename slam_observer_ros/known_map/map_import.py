@@ -19,6 +19,7 @@ import numpy as np
 
 from slam_observer_ros.common.errors import MapError, shown, YamlError
 from slam_observer_ros.common.files import load_yaml, plain_value, read_text
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import se3, so3
@@ -79,7 +80,8 @@ def import_map(
         raise MapError(f'{path}: it is not laid out as {LAYOUTS}') from error
     if left_out:
         more = ', …' if len(left_out) > MAX_NAMED else ''
-        logger.warning('%s: left out: %s', path, ', '.join(left_out[:MAX_NAMED]) + more)
+        columns = ', '.join(left_out[:MAX_NAMED]) + more
+        logger.warning('%s', found('left_out_of_table', path=path, columns=columns))
     if not rows:
         raise MapError(f'{path}: there are no landmarks in it')
     _check_ids(path, rows)

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.linalg import orth, solve_triangular
 
 from slam_observer_ros.common.errors import MapError
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
@@ -93,8 +92,7 @@ def joint_covariance(
     None where the gains know no joint covariance.
     """
     m, axes, points = len(rows), state.axes, state.observer.points[rows]
-    joint = state.joint
-    P = None if joint is None else joint.of_landmarks(rows, points, tags)
+    P = state.gains.landmark_covariance(rows, tags)
     if P is None or m == 0:
         return P
     # As the square of a root, so that rounding makes no variance negative, however small it is.
@@ -188,17 +186,17 @@ def _renumber(state: State, known: LandmarkMap, rows: IntArray, known_ids: IntAr
 def _complete(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
     """Go on in a map, ``added`` the part of it that the state did not have."""
     mode = state.settings.localization_mode
+    if mode == 'fixed':
+        _fix(state, known, added)
     state.landmarks.add_known(added.ids, _counts(added, state))
     state.is_mapping = mode == 'off'
-    if mode == 'fixed':
-        _fix(state, known)
     state.forget_past('the pose in the loaded map was found')
 
 
-def _fix(state: State, known: LandmarkMap) -> None:
-    """Put the landmarks exactly where the map has them, and leave them there."""
-    order = np.argsort(known.ids)
-    rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
+def _fix(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
+    """Put the landmarks, and those added, where the map has them, and leave them there."""
+    order, ids = np.argsort(known.ids), np.append(state.landmarks.ids, added.ids)
+    rows = order[np.searchsorted(known.ids, ids, sorter=order)]
     exact = _in_reference_frame(state, known.select(rows))
     state.fix_landmarks(exact)
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg.blas import dsyr2k, dsyrk
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, LandmarkColumns
+from slam_observer_ros.observer.landmark_table import LandmarkTable
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -86,6 +87,11 @@ class LandmarkOrientations(LandmarkColumns):
     def clear(self, rows: IntArray) -> None:
         """Let landmarks have no orientation."""
         self.B[rows] = 0.0
+
+    def reset(self) -> None:
+        """Let no landmark have an orientation, and none ever seen."""
+        for name in self.COLUMNS:
+            getattr(self, name)[...] = 0
 
     def turn(self, rows: IntArray | slice, turns: FloatArray) -> None:
         """Turn orientations of landmarks (m,) to R_i B̂_i, with ``turns`` R_i (m, 3, 3)."""
@@ -218,8 +224,8 @@ class FilterArrays(LandmarkColumns):
 
     Only this folder writes to them; others read, and copy what they keep. Attributes are
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
-    each (n, 3), metres and m/s, the ``orientations`` of tags, and ``covariance``, P (N, N), empty
-    for gains that know none.
+    each (n, 3), metres and m/s, the ``orientations`` of tags, what was seen of each landmark
+    (``landmarks``), and ``covariance``, P (N, N), empty for gains that know none.
     ``calibration`` (43 + 7 s,) has the values of velocities and of s sensors
     (:mod:`.sensor_models.calibration`).
     ``have_moved`` says whether any landmark has had a velocity so far, ``is_exact`` that the map
@@ -237,7 +243,7 @@ class FilterArrays(LandmarkColumns):
         self.A: FloatArray = np.eye(4)
         self.covariance = SymmetricMatrix(np.zeros((0, 0)))
         self.calibration: FloatArray = np.empty(0)
-        self.orientations = LandmarkOrientations()
+        self.orientations, self.landmarks = LandmarkOrientations(), LandmarkTable()
         self.have_moved = self.is_exact = False
         self.postponed: Postponed | None = None
 
@@ -251,5 +257,17 @@ class FilterArrays(LandmarkColumns):
         other = super().copy()
         other.reference_pose, other.A = self.reference_pose.copy(), self.A.copy()
         other.covariance, other.calibration = self.covariance.copy(), self.calibration.copy()
-        other.orientations = self.orientations.copy()
+        other.orientations, other.landmarks = self.orientations.copy(), self.landmarks.copy()
         return other
+
+    def append_zeros(self, m: int) -> IntArray:
+        """Append landmarks; return which (m,)."""
+        self.orientations.append_zeros(m)
+        self.landmarks.append_zeros(m)
+        return super().append_zeros(m)
+
+    def delete(self, rows: IntArray) -> None:
+        """Delete landmarks; those behind move up."""
+        self.orientations.delete(rows)
+        self.landmarks.delete(rows)
+        super().delete(rows)

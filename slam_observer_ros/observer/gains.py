@@ -156,6 +156,9 @@ class Gains(ABC):
         self.observer.propagate(motion.path)
         self.observer.move_landmarks(motion.duration_s)
 
+    def activate(self, rows: IntArray) -> None:  # noqa: B027 (most gains treat all alike)
+        """See to it that landmarks (m,) are at hand that are going to be observed."""
+
     def prepare(self, rows: IntArray) -> None:  # noqa: B027 (most gains postpone nothing)
         """Bring landmarks (m,) up to date that are going to be observed; −1 for a new one."""
 
@@ -253,12 +256,23 @@ class Gains(ABC):
         """(c,) variances of the calibration's estimates."""
         return np.empty(0)
 
+    @property
+    def takes_all(self) -> bool:
+        """Whether an observation changes what is known of all landmarks, however many."""
+        return False
+
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks, if it is known."""
-        return None if self.errors is None else self.errors.joint_covariance(rows)
+        return None
+
+    def landmark_covariance(self, rows: IntArray, tags: IntArray) -> FloatArray | None:
+        """Return that (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,), if known."""
+        return None
+
+    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
+        """Return the joint covariance (m k, m k) of residuals; (0, 0) where none is known."""
+        return np.empty((0, 0))
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
-        return (
-            np.zeros(len(residuals.r)) if self.errors is None else self.errors.distances(residuals)
-        )
+        return np.zeros(len(residuals.r))

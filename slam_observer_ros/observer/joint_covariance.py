@@ -7,9 +7,10 @@ The blocks C_i of all methods are of ε (m, k, p), or of (ε, c̃), the first en
 from __future__ import annotations
 
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf
 
@@ -68,6 +69,11 @@ class JointCovariance:
         other = copy(self)
         other._matrix = observer.covariance
         return other
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether landmarks are estimated, but no velocities of theirs."""
+        return not self.chart.velocity
 
     @property
     def pose(self) -> FloatArray:
@@ -146,6 +152,10 @@ class JointCovariance:
         return B
 
     # The step
+
+    def put_back(self, column: NDArray[Any], active: NDArray[Any]) -> None:
+        """Write what was read of all landmarks' ``column`` at those in P, and changed, there."""
+        # Here this is a view.
 
     def note_motion(self) -> None:
         """Note that the robot has moved."""

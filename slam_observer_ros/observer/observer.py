@@ -95,7 +95,6 @@ class Observer(FilterArrays):
 
     def add_reference_landmarks(self, y_ref: FloatArray) -> None:
         """Append landmarks with given y_i° (m, 3), metres, and â_i = 0."""
-        self.orientations.append_zeros(len(y_ref))
         rows = self.append_zeros(len(y_ref))
         self.y_ref[rows] = y_ref
 
@@ -106,9 +105,11 @@ class Observer(FilterArrays):
         self.orientations.clear(rows)
 
     def fix_landmarks(self, y_ref: FloatArray) -> None:
-        """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest, for good."""
-        self.remove_landmarks(np.arange(len(self)))
-        self.add_reference_landmarks(y_ref)
+        """Put all landmarks at ``y_ref`` (n + m, 3), m of which are new, at rest, for good."""
+        self.append_zeros(len(y_ref) - len(self))
+        self.set_reference(y_ref)
+        self.u[...] = 0.0
+        self.orientations.reset()
         self.have_moved, self.is_exact = False, True
 
     def set_reference(self, y_ref: FloatArray) -> None:
@@ -119,7 +120,6 @@ class Observer(FilterArrays):
     def remove_landmarks(self, rows: IntArray) -> None:
         """Delete the landmarks at ``rows``; those behind move up."""
         self.delete(rows)
-        self.orientations.delete(rows)
 
     def set_landmark_velocities(self, rows: IntArray, velocities: FloatArray) -> None:
         """Let landmarks move at ``velocities`` v_i (m, 3), m/s, body frame now, or rest (19)."""

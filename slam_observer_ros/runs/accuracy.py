@@ -19,9 +19,9 @@ from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import Smoothed, Update
-from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.metrics import (
     ConfigurationError,
@@ -30,7 +30,6 @@ from slam_observer_ros.evaluation.metrics import (
     TrajectoryErrors,
 )
 from slam_observer_ros.evaluation.trajectory import filled, Trajectory
-from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.sensor_models.calibration import (
@@ -116,7 +115,7 @@ def smoothed_trajectory(
     smoothed: Smoothed,
     stamps_ns: IntArray,
     dead_reckoning: Trajectory,
-    estimator: Estimator,
+    estimator: Estimate,
 ) -> Trajectory:
     """Return the smoothed poses at any stamps (m,), such as those of the online trajectory.
 
@@ -127,7 +126,7 @@ def smoothed_trajectory(
     return filled(estimate, _calibrated(dead_reckoning, estimator), stamps_ns)
 
 
-def _calibrated(motion: Trajectory, estimator: Estimator) -> Trajectory:
+def _calibrated(motion: Trajectory, estimator: Estimate) -> Trajectory:
     """Return dead reckoning as it is with the scales, biases and the delay of the velocities."""
     if len(motion) < 2:
         return motion

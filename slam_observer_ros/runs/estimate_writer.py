@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from slam_observer_ros.common.stamps import is_due, NANOSECONDS_PER_SECOND
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import Update
-from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import LandmarkTruth
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.messages.estimate_messages import (
     encode_transform,
     EstimateMessages,
@@ -69,7 +69,7 @@ class EstimateWriter:
         self._path_ns: int | None = None
         self._overview_ns: int | None = None
 
-    def note_stamp(self, estimator: Estimator) -> None:
+    def note_stamp(self, estimator: Estimate) -> None:
         """Write the state when all events of a stamp have been used, if it is due."""
         stamp_ns = estimator.stamp_ns
         if stamp_ns is None or not estimator.is_localised:
@@ -98,7 +98,7 @@ class EstimateWriter:
 
     def finish(
         self,
-        estimator: Estimator,
+        estimator: Estimate,
         errors: TrajectoryErrors | None,
         landmarks: LandmarkTruth | None,
     ) -> None:
@@ -120,7 +120,7 @@ class EstimateWriter:
             )
             self._write(ALIGNED_LANDMARKS_TOPIC, cloud, first_ns, latched=True)
 
-    def _write_state(self, estimator: Estimator, stamp_ns: int) -> None:
+    def _write_state(self, estimator: Estimate, stamp_ns: int) -> None:
         pose, covariance = estimator.uncertain_pose
         uncertain = uncertain_pose(pose, covariance)
         message = self._state.pose(stamp_ns, uncertain)
@@ -135,7 +135,7 @@ class EstimateWriter:
             self._path_ns = stamp_ns
             self._path.append(self._messages.path_pose(stamp_ns, pose))
 
-    def _write_landmarks(self, estimator: Estimator, stamp_ns: int) -> None:
+    def _write_landmarks(self, estimator: Estimate, stamp_ns: int) -> None:
         landmarks = (
             estimator.landmark_ids,
             estimator.world_points,

@@ -13,7 +13,7 @@ from slam_observer_ros.recording.contents import Arrivals
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.health import of_stamps
-from slam_observer_ros.runs.replay import Replay
+from slam_observer_ros.runs.reported_run import Replay
 from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

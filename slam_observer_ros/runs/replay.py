@@ -8,21 +8,20 @@ observations alike, so that stretches in which nothing is seen count too.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 import time
 from typing import ParamSpec, Protocol, runtime_checkable
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import RangePower, Update, used_points
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import Update, used_points
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityBlock
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, Truth
+from slam_observer_ros.runs.reported_run import Replay
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.sensor_models.sensing import RangeErrors
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
@@ -53,65 +52,6 @@ class StampRecorder(Recorder, Protocol):
 
     def note_stamp(self, estimator: Estimator) -> None:
         """Take in the state when all events of a stamp have been used."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Replay:
-    """What came of a replay; since the last reset, if the clock jumped.
-
-    Attributes
-    ----------
-    estimator : Estimator
-        In its final state, with the map and the events dropped.
-    trajectory, pose_covariances : Trajectory, FloatArray or None
-        k poses of the online estimate, and (k, 6, 6) :attr:`.Estimator.pose_covariance` of each;
-        None without truth to compare their errors with.
-    dead_reckoning : Trajectory
-        What the velocities alone give, from the identity pose.
-    configuration : ConfigurationError
-        Gauge-free error after each observation; empty without truth.
-    residual_stamps_ns, residuals, rejected : (m,), (m, 3), (m,)
-        Residuals of the landmarks seen, metres, and which were too large to be used.
-    seconds : float
-        CPU time of the estimator alone, without reading and measuring.
-    start_ns : int
-        Stamp of the first event that was used, nanoseconds; 0 if none was.
-    range_power : RangePower or None
-        How ranges grow with the cosine of the angle off the sensor's axis.
-    localised_ns : (int, int) or None
-        First and last stamp at which the pose in its final frame was known; None if it never was.
-    events, observations, angular_velocities : int
-        Events, dropped ones included; observations with points that were used; angular velocities
-        of an Imu that were taken in: all of them also before the last reset.
-
-    """
-
-    estimator: Estimator
-    trajectory: Trajectory
-    pose_covariances: FloatArray | None
-    dead_reckoning: Trajectory
-    configuration: ConfigurationError
-    residual_stamps_ns: IntArray
-    residuals: FloatArray
-    rejected: BoolArray
-    events: int
-    seconds: float
-    in_known_map: bool
-    start_ns: int
-    localised_ns: tuple[int, int] | None
-    range_power: RangePower | None
-    observations: int
-    angular_velocities: int
-
-    @property
-    def resets(self) -> int:
-        """How often the estimator was reset by a jump of the clock."""
-        resets = self.estimator.settings.on_time_jump == 'reset'
-        return self.estimator.jumps if resets else 0
-
-    def seconds_until(self, stamp_ns: int) -> float:
-        """Return the time from the first event to a stamp, seconds."""
-        return to_s(stamp_ns - self.start_ns)
 
 
 def replay(

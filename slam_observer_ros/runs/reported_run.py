@@ -1,4 +1,4 @@
-"""What a report is made of, and what of it is recorded while a run goes on.
+"""What came of a run: figures of a replay, and what a report shows, recorded while it goes on.
 
 Memory and time are bounded: as a run grows longer, instants lie further apart.
 """
@@ -10,11 +10,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import is_due
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, Innovations, Instant, Update
-from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
+from slam_observer_ros.common.stamps import is_due, to_s
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import (
+    CalibrationEstimate,
+    Innovations,
+    Instant,
+    RangePower,
+    Update,
+)
+from slam_observer_ros.estimator.estimate import Estimate
+from slam_observer_ros.evaluation.metrics import ConfigurationError, pose_errors, TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import interpolate, LandmarkTruth, Trajectory
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
@@ -45,7 +51,7 @@ class RunRecorder:
         if len(update.ids):
             self._updates.append(update)
 
-    def note_stamp(self, estimator: Estimator) -> None:
+    def note_stamp(self, estimator: Estimate) -> None:
         """Take in the state when all events of a stamp have been used, if one is due."""
         stamp_ns = estimator.stamp_ns
         if stamp_ns is None or not estimator.is_localised:
@@ -62,7 +68,7 @@ class RunRecorder:
     def _last_ns(self) -> int | None:
         return self._instants[-1].stamp_ns if self._instants else None
 
-    def finish(self, estimator: Estimator) -> tuple[Instant, ...]:
+    def finish(self, estimator: Estimate) -> tuple[Instant, ...]:
         """Return the instants in the order of their stamps, the end of the run as the last."""
         by_stamp = {instant.stamp_ns: instant for instant in self._instants}
         if estimator.stamp_ns is not None and estimator.is_localised:
@@ -127,7 +133,7 @@ class NisTally:
         return self._nis / total if total else None
 
 
-def _instant(estimator: Estimator, stamp_ns: int) -> Instant:
+def _instant(estimator: Estimate, stamp_ns: int) -> Instant:
     return Instant(
         stamp_ns=stamp_ns,
         pose=estimator.pose,
@@ -138,6 +144,65 @@ def _instant(estimator: Estimator, stamp_ns: int) -> Instant:
         calibration=tuple(estimator.calibration),
         dropped=estimator.dropped.copy(),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What came of a replay; since the last reset, if the clock jumped.
+
+    Attributes
+    ----------
+    estimator : Estimate
+        In its final state, with the map and the events dropped.
+    trajectory, pose_covariances : Trajectory, FloatArray or None
+        k poses of the online estimate, and (k, 6, 6) :attr:`.Estimator.pose_covariance` of each;
+        None without truth to compare their errors with.
+    dead_reckoning : Trajectory
+        What the velocities alone give, from the identity pose.
+    configuration : ConfigurationError
+        Gauge-free error after each observation; empty without truth.
+    residual_stamps_ns, residuals, rejected : (m,), (m, 3), (m,)
+        Residuals of the landmarks seen, metres, and which were too large to be used.
+    seconds : float
+        CPU time of the estimator alone, without reading and measuring.
+    start_ns : int
+        Stamp of the first event that was used, nanoseconds; 0 if none was.
+    range_power : RangePower or None
+        How ranges grow with the cosine of the angle off the sensor's axis.
+    localised_ns : (int, int) or None
+        First and last stamp at which the pose in its final frame was known; None if it never was.
+    events, observations, angular_velocities : int
+        Events, dropped ones included; observations with points that were used; angular velocities
+        of an Imu that were taken in: all of them also before the last reset.
+
+    """
+
+    estimator: Estimate
+    trajectory: Trajectory
+    pose_covariances: FloatArray | None
+    dead_reckoning: Trajectory
+    configuration: ConfigurationError
+    residual_stamps_ns: IntArray
+    residuals: FloatArray
+    rejected: BoolArray
+    events: int
+    seconds: float
+    in_known_map: bool
+    start_ns: int
+    localised_ns: tuple[int, int] | None
+    range_power: RangePower | None
+    observations: int
+    angular_velocities: int
+
+    @property
+    def resets(self) -> int:
+        """How often the estimator was reset by a jump of the clock."""
+        resets = self.estimator.settings.on_time_jump == 'reset'
+        return self.estimator.jumps if resets else 0
+
+    def seconds_until(self, stamp_ns: int) -> float:
+        """Return the time from the first event to a stamp, seconds."""
+        return to_s(stamp_ns - self.start_ns)
 
 
 MIN_GAP_S = 3.0

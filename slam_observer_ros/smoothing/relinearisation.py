@@ -25,6 +25,7 @@ from typing import Protocol
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError, SmoothingError
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
@@ -56,6 +57,8 @@ MAX_INTERVAL = 300
 MAX_UNKNOWNS = 600
 """Most unknowns of a map that is relinearised, in some tenths of a second: 100 tags in space."""
 
+NO_HISTORY = "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
+
 CUT = 'the history was cut (smoothing_window=0 keeps all of it)'
 
 MAX_TURN_RAD = 0.2
@@ -83,7 +86,75 @@ class KnownErrors(Protocol):
     joint: JointCovariance
 
 
-class Relinearisation:
+class Owner(Protocol):
+    """What keeps a past beside its estimate."""
+
+    calibration: Calibration
+
+    @property
+    def known_errors(self) -> KnownErrors:
+        """What is known of the errors, where anything is relinearised."""
+
+
+class Past:
+    """What was seen by a filter that linearises none of it again, and keeps nothing."""
+
+    @property
+    def is_active(self) -> bool:
+        """Whether there is a history."""
+        return False
+
+    def copy(self, owner: Owner) -> Past:
+        """Return an independent copy for a copy of its owner."""
+        return self
+
+    def reset(self, since: str) -> None:
+        """Begin a new history with the present estimate; ``since`` says why, in words."""
+
+    def move(self, motion: Motion) -> None:
+        """Note a motion of the robot."""
+
+    def move_on(
+        self,
+        start: FloatArray,
+        end: FloatArray,
+        noise: FloatArray,
+        sensitivity: FloatArray,
+        duration_s: float,
+    ) -> None:
+        """Note a motion from pose to pose (4, 4), with what :class:`.Motion` has of it."""
+
+    def note_correction(self, before: FloatArray, after: FloatArray) -> None:
+        """Note a correction that turned the robot from Â to another (4, 4)."""
+
+    def add(self, keyframe: Keyframe, in_doubt: bool) -> None:
+        """Add a keyframe, of a landmark ``in_doubt`` or none."""
+
+    def add_calibration(self) -> None:
+        """Note what is estimated of the calibration from now on, beside what was so far."""
+
+    def relocate(self, rows: IntArray) -> None:
+        """Forget all about landmarks (m,) but their latest observation."""
+
+    def forget_orientations(self, rows: IntArray) -> None:
+        """Forget how landmarks (m,) are turned."""
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget landmarks; those behind move up."""
+
+    def merge(self, rows: IntArray, copies: IntArray) -> None:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,), as the filter has done."""
+
+    def smooth(self) -> tuple[Step, int, History]:
+        """Return the last step of smoothing, how many slips it confirms, and what it is of.
+
+        Raise :exc:`ParameterError` if what the smoother takes for constant is not, or no history
+        is kept, :exc:`SmoothingError` if the observations don't determine everything.
+        """
+        raise ParameterError(NO_HISTORY)
+
+
+class Relinearisation(Past):
     """Keeps the ``history`` of a filter since a prior, and relinearises it when it is due.
 
     Relinearising changes the observer and the covariance of ``errors``, and the ``calibration``.
@@ -101,11 +172,11 @@ class Relinearisation:
         self._turn_squared = self._largest_turn = 0.0
         self.reset('the last start')
 
-    def copy(self, errors: KnownErrors, calibration: Calibration) -> Relinearisation:
-        """Return an independent copy for a copy of errors and calibration."""
-        other = copy(self)
+    def copy(self, owner: Owner) -> Relinearisation:
+        """Return an independent copy for a copy of its owner."""
+        other, errors = copy(self), owner.known_errors
         other._errors, other._observer = errors, errors.observer
-        other._calibration, other.history = calibration, self.history.copy()
+        other._calibration, other.history = owner.calibration, self.history.copy()
         return other
 
     @property
@@ -115,7 +186,7 @@ class Relinearisation:
 
     def reset(self, since: str) -> None:
         """Begin a new history with the present estimate; ``since`` says why, in words."""
-        self._is_given_up = not self._joint.is_dense
+        self._is_given_up = not self._is_dense
         self._start(self._known(), since)
 
     def move(self, motion: Motion) -> None:
@@ -127,6 +198,20 @@ class Relinearisation:
             self.reset('a landmark came with a velocity')
         else:
             self.history.move(motion)
+
+    def move_on(
+        self,
+        start: FloatArray,
+        end: FloatArray,
+        noise: FloatArray,
+        sensitivity: FloatArray,
+        duration_s: float,
+    ) -> None:
+        """Note a motion from pose to pose (4, 4), with what :class:`.Motion` has of it."""
+        if self.is_active:
+            drift = self._calibration.drift_covariance * duration_s
+            self.history.begin(start)
+            self.history.move_on(end, noise, sensitivity, drift, self._calibration)
 
     def note_correction(self, before: FloatArray, after: FloatArray) -> None:
         """Note a correction that turned the robot from Â to another (4, 4)."""
@@ -148,7 +233,7 @@ class Relinearisation:
         self.history.add(keyframe, self._observer.A.copy(), self._calibration.values)
         self._seen += 1
         self._observations += 1
-        if not self._joint.is_dense:
+        if not self._is_dense:
             if self._window_is_full:
                 self.reset(CUT)
         elif in_doubt:
@@ -188,16 +273,14 @@ class Relinearisation:
             self.history.summarise(self._known().least_nonlinear(self._axes)[0])
             self._clear_counts()
 
-    def smooth(self) -> tuple[Step, int]:
+    def smooth(self) -> tuple[Step, int, History]:
         """Return the last step of smoothing, and how many slips it confirms (:mod:`.slips`).
 
-        Its estimates are iterated from the present ones, which stay as they are. Raise
-        :exc:`ParameterError` if what the smoother takes for constant is not, or no history is
-        kept, :exc:`SmoothingError` if the observations don't determine everything.
+        Its estimates are iterated from the present ones, which stay as they are.
         """
         self._check_smoothable()
         try:
-            return self._smoothed()
+            return *self._smoothed(), self.history
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
                 'can not smooth: the observations leave some pose or landmark open, or contradict '
@@ -224,9 +307,7 @@ class Relinearisation:
 
     def _check_smoothable(self) -> None:
         if self._settings.relinearization_interval == 0:
-            raise ParameterError(
-                "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
-            )
+            raise ParameterError(NO_HISTORY)
         if self._observer.have_moved:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
         if self._is_given_up:
@@ -237,6 +318,11 @@ class Relinearisation:
     @property
     def _joint(self) -> JointCovariance:
         return self._errors.joint  # which may become one for large maps
+
+    @property
+    def _is_dense(self) -> bool:
+        """Whether what is relinearised can be taken over: P has all landmarks."""
+        return self._joint.is_dense
 
     def _start(self, prior: Prior, since: str) -> None:
         self.history = History(self._axes, self._observation_noise, prior, since)
@@ -373,8 +459,4 @@ class _Warning:
         if self._is_given:
             return
         self._is_given = True
-        logger.warning(
-            'Could not relinearise (said only once): the observations so far leave something '
-            'open, as where covariances are so large that they say nothing. Odometry often has '
-            'such for z, roll and pitch: set two_d_mode: true for a robot on a floor.'
-        )
+        logger.warning('%s', found('not_relinearised'))

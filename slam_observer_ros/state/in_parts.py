@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, IntArray
+from slam_observer_ros.common.types import BoolArray, IntArray, is_automatic
 from slam_observer_ros.estimates import NormalisedInnovation, Update
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.observer.step import DONE, REJECTS
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import (
@@ -19,7 +19,6 @@ from slam_observer_ros.state.matching import (
     Expected,
     is_contradiction,
     keyframe_of,
-    point_covariances,
     positions,
 )
 from slam_observer_ros.state.state import State
@@ -64,7 +63,6 @@ def _in_parts(
         return None
     shown, used = corrected(state, event), known.copy()  # by the calibration before the step
     new = shown.select(~known)
-    noise = point_covariances(state, new, rows[~known])
     of_used = None
     if np.count_nonzero(known):
         if of_all is None:
@@ -82,9 +80,9 @@ def _in_parts(
         state.landmarks.reject(rows[rejected], *positions(state, shown.select(rejected)))
         state.counts['rejected_landmark'] += int(np.count_nonzero(rejected))
     if len(new.ids):
-        enter(state, new, noise)
+        enter(state, new, state.observation_noise.covariances(new))
     past = state.relinearisation
-    if past is not None and past.is_active:
+    if past.is_active:
         past.add(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)), in_doubt=False)
     expected = None if of_used is None else usual.expected(state, of_used.out)
     return _update(state, event, known, rejected[known], of_all, of_used), expected

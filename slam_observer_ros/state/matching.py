@@ -45,9 +45,8 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
     m, rows = len(event.ids), state.landmarks.rows_of(event.ids)
     if not state.is_mapping:
         event, rows = mapped(state, event)
-    is_known, joint = rows >= 0, state.joint
-    if joint is not None:
-        joint.activate(rows[is_known])  # before anything is asked of them
+    is_known = rows >= 0
+    state.gains.activate(rows[is_known])  # before anything is asked of them
     covariances = point_covariances(state, event, rows)
     left_out = m - len(event.ids)
     if np.count_nonzero(is_known) == len(rows):  # as nearly always
@@ -208,11 +207,11 @@ class Expected:
     def of(cls, gains: Gains, residuals: Residuals) -> Expected:
         """Ask gains, before they correct the state."""
         r, R = residuals.on(gains.axes)
-        if gains.errors is not None and len(r):
-            S = gains.errors.innovation_covariance(residuals)
+        if not len(r):
+            return cls(r, np.empty(0), R, np.empty((0, 0)))
+        if len(S := gains.innovation_covariance(residuals)):
             return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), R, S)
-        distances = gains.distances(residuals) if len(r) else np.empty(0)
-        return cls(r, distances, R, np.empty((0, 0)))
+        return cls(r, gains.distances(residuals), R, S)
 
     def judge(self, weights: FloatArray, shares: FloatArray) -> NormalisedInnovation:
         """Return how far off the residuals are, given the weights (m,) of the correction.

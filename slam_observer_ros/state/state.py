@@ -14,16 +14,14 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
 from slam_observer_ros.observer.continuous_time import lyapunov
 from slam_observer_ros.observer.gains import Errors, Gains
-from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.relinearisation import Relinearisation
+from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
 from slam_observer_ros.state import covariances
-from slam_observer_ros.state.landmark_table import LandmarkTable
 
 
 class State:
@@ -36,11 +34,11 @@ class State:
         self.gains, self.errors = gains, gains.errors  # they move X̂, and know its errors or not
         self.observer, self.axes = gains.observer, gains.axes
         self.calibration, self.motion_noise = gains.calibration, gains.motion_noise
-        self.landmarks = LandmarkTable()
+        self.landmarks = self.observer.landmarks
         # How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it.
         is_ignored = 'landmark_velocity_stddev' in gains.ignores
         self.landmark_velocity_stddev = 0.0 if is_ignored else settings.landmark_velocity_stddev
-        self.relinearisation: Relinearisation | None = None  # where errors are known
+        self.relinearisation = Past()
         if self.errors is not None and not self.landmark_velocity_stddev:
             self.relinearisation = Relinearisation(self.errors, self.calibration, settings)
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
@@ -56,16 +54,9 @@ class State:
         other.gains = gains = self.gains.copy()
         other.observer, other.errors = gains.observer, gains.errors
         other.calibration, other.motion_noise = gains.calibration, gains.motion_noise
-        other.landmarks, other.counts = self.landmarks.copy(), self.counts.copy()
-        if self.relinearisation is not None:
-            past = self.relinearisation.copy(other.known_errors, other.calibration)
-            other.relinearisation = past
+        other.landmarks, other.counts = gains.observer.landmarks, self.counts.copy()
+        other.relinearisation = self.relinearisation.copy(other)
         return other
-
-    @property
-    def joint(self) -> JointCovariance | None:
-        """P, in the form that suits the map, of gains that know it."""
-        return None if self.errors is None else self.errors.joint
 
     @property
     def known_errors(self) -> Errors:
@@ -159,8 +150,7 @@ class State:
     def propagate(self, motion: Motion) -> None:
         """Move on along a motion (27)."""
         self.gains.advance(motion)
-        if self.relinearisation is not None:
-            self.relinearisation.move(motion)
+        self.relinearisation.move(motion)
         if motion.at_ends is not None:
             self._end_velocity = motion.at_ends[1]
 
@@ -211,37 +201,30 @@ class State:
 
     def forget_past(self, since: str) -> None:
         """Relinearise nothing of what was seen until now; ``since`` says what has happened."""
-        if self.relinearisation is not None:
-            self.relinearisation.reset(since)
+        self.relinearisation.reset(since)
 
     def add_sensor(self, frame: str) -> None:
         """Begin to calibrate the sensor of another frame."""
         self.gains.add_sensor(frame)
-        if self.relinearisation is not None:
-            self.relinearisation.add_calibration()
+        self.relinearisation.add_calibration()
 
     def relocate(
         self, rows: IntArray, points: FloatArray, covariances: FloatArray, D: FloatArray | None
     ) -> None:
         """Take landmarks (m,) for new ones: :meth:`.Gains.relocate`."""
         self.gains.relocate(rows, points, covariances, D)
-        if self.relinearisation is not None:
-            self.relinearisation.relocate(rows)
+        self.relinearisation.relocate(rows)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``; those behind move up."""
-        if self.relinearisation is not None:
-            self.relinearisation.remove(rows)
+        self.relinearisation.remove(rows)
         self.gains.remove(rows)
-        self.landmarks.remove(rows)
 
     def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
         """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: :meth:`.Gains.merge`."""
         square = self.gains.merge(rows, copies, most)
         if square <= most:
-            self.landmarks.merge(rows, copies)
-            if self.relinearisation is not None:
-                self.relinearisation.merge(rows, copies)
+            self.relinearisation.merge(rows, copies)
             self.counts['merged_landmark'] += len(rows)
         return square
 
@@ -255,7 +238,7 @@ class State:
         """Take all landmarks for exact and at rest where a map has them."""
         self.gains.fix_landmarks(known)
         self.landmark_velocity_stddev = 0.0
-        self.relinearisation = None  # there is no drift to undo
+        self.relinearisation = Past()  # there is no drift to undo
 
     def smooth(self) -> Smoothed:
         """Return the smoothed trajectory and map; see :meth:`.Relinearisation.smooth`."""
@@ -265,17 +248,13 @@ class State:
             raise ParameterError(
                 "smoothing takes landmarks to rest: 'landmark_velocity_stddev' must be 0"
             )
-        if self.relinearisation is None:
-            raise ParameterError(
-                "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
-            )
         # From the reference frame to the world.
-        (step, slips), rows = self.relinearisation.smooth(), self.confirmed
+        (step, slips, history), rows = self.relinearisation.smooth(), self.confirmed
         found, calibration = step.end, self.calibration
         entries = slice(self.axes.p, self.axes.p + calibration.count)
         covariance = step.marginal()[entries, entries]
         values = calibration.shifted(found.calibrations[-1] - calibration.values)
-        history, P = self.relinearisation.history, self.observer.reference_pose
+        P = self.observer.reference_pose
         return Smoothed(
             stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
             poses=P @ found.poses[1:],

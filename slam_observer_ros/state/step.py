@@ -60,8 +60,7 @@ def _correct(state: State, residuals: Residuals) -> FloatArray:
         return np.empty(0)
     before = state.observer.A.copy()
     weights = state.gains.observe(residuals)
-    if state.relinearisation is not None:
-        state.relinearisation.note_correction(before, state.observer.A)
+    state.relinearisation.note_correction(before, state.observer.A)
     return weights
 
 
@@ -86,7 +85,7 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     some_are = bool(np.count_nonzero(in_doubt))
     past = state.relinearisation
-    if past is not None and past.is_active:
+    if past.is_active:
         turns = seen_orientations(state, event, rows)
         past.add(keyframe_of(state, event, rows, turns), some_are)
     if some_are:
@@ -181,8 +180,7 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
         return matched
     before = state.observer.A.copy()
     weights, are_unclear = gains.correct_by_orientations(seen)
-    if state.relinearisation is not None:
-        state.relinearisation.note_correction(before, state.observer.A)
+    state.relinearisation.note_correction(before, state.observer.A)
     judged = ~are_unclear
     tags.count(seen.rows[judged], weights[judged] > 0.0)
     state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
@@ -209,7 +207,7 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
     if not len(seen.rows):
         return
     replaced = seen.rows[tags.are_known[seen.rows]]
-    if state.relinearisation is not None and len(replaced):
+    if len(replaced):
         state.relinearisation.forget_orientations(replaced)
     gains.add_orientations(seen)
 

@@ -28,7 +28,6 @@ from slam_observer_ros.observer.flat_arrays import (
     Seen,
 )
 from slam_observer_ros.observer.joint_covariance import JointCovariance
-from slam_observer_ros.observer.riccati.covariances import ExactMapCovariance
 from slam_observer_ros.observer.robust import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.motion_noise import Factors
@@ -48,25 +47,21 @@ def advance(
     state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
 ) -> FloatArray | None:
     """Move a state on between two stamps (27); return the variances (6,) of the motion by axis."""
-    joint = state.joint
-    if joint is None or not _is_at_rest(state, joint):
+    joint = _at_rest(state)
+    if joint is None:
         return None
     x = _estimate(state, joint)
     status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
     if status == step.UNUSUAL:
         return None
-    calibration = state.calibration
     joint.note_motion()
-    if state.relinearisation is not None and state.relinearisation.is_active:
-        history = state.relinearisation.history
-        history.begin(x.A)
-        drift = x.drift * to_s(end_ns - start_ns)
-        history.move_on(out.A, out.noise, out.sensitivity, drift, calibration)
+    duration_s = to_s(end_ns - start_ns)
+    state.relinearisation.move_on(x.A, out.A, out.noise, out.sensitivity, duration_s)
     of_driving = out.noise - out.of_turning
     is_rest = status == step.AT_REST
     state.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
     x.A[...] = out.A
-    if calibration.delay_error_ns:
+    if state.calibration.delay_error_ns:
         state._end_velocity = out.at_end
     return out.variances
 
@@ -98,13 +93,13 @@ def _led_to(
 
     Until each instant along the velocities known then.
     """
-    joint, axes = state.joint, state.axes
-    if joint is None or core.COMPILED is None:  # in numpy the general way costs less
+    errors, axes = state.errors, state.axes
+    if errors is None or core.COMPILED is None:  # in numpy the general way costs less
         return None
     # Landmarks have no part in it.
-    now = joint.of_robot
+    now = errors.joint.of_robot
     P, p, figures = now.copy(), axes.p, state.motion_noise.figures
-    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, (len(P), len(P), joint.chart.stride))
+    x = _estimate_of(state, _NO_POINTS, _NO_POINTS, P, (len(P), len(P), errors.joint.chart.stride))
     A, covariances = np.empty((len(ends_ns), 4, 4)), np.zeros((len(ends_ns), 6, 6))
     out = _room_for_motion(state)
     for row, (known, end_ns) in enumerate(zip(velocities, ends_ns, strict=True)):
@@ -136,7 +131,7 @@ class Corrected(NamedTuple):
 def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Update:
     """Keep a keyframe of an observation that has corrected a state by all its points."""
     past, out = state.relinearisation, corrected.out
-    if past is not None and past.is_active:
+    if past.is_active:
         past.add(keyframe(state, event, corrected), in_doubt=False)
     none_rejected = np.zeros(len(event.ids), dtype=np.bool_)
     judged = innovation(state, out)
@@ -148,14 +143,13 @@ def takes(state: State, event: ObservationEvent) -> bool:
 
     It must be of the state's instant, by a sensor that is known.
     """
-    calibration, joint = state.calibration, state.joint
+    calibration, joint = state.calibration, _at_rest(state)
     return (
         event.velocities is None
         and event.orientations is None
         and event.sensed is None  # late, and carried forward
         and not (calibration.corrects_points and event.sensor_frame not in calibration.sensors)
         and joint is not None
-        and _is_at_rest(state, joint)
         and joint.chart.stride == state.axes.point
     )
 
@@ -172,8 +166,8 @@ def correct(
     The observation is one that the state :func:`takes`, or the part of one that ``of_all`` has not
     rejected. If it ``is_weighed``, the results have what was expected of the points.
     """
-    m, k, joint = len(rows), state.axes.point, state.joint
-    if joint is None or not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
+    m, k, joint = len(rows), state.axes.point, state.known_errors.joint
+    if not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
         return None
     joint.activate(rows)
     x, places = _estimate(state, joint), joint.places(rows)
@@ -209,14 +203,11 @@ def correct(
         return None
     if status == step.DONE:
         noise.take(factors if of_all is None else of_all.factors)
-        if state.relinearisation is not None:
-            state.relinearisation.note_correction(x.A, out.A)
+        state.relinearisation.note_correction(x.A, out.A)
         x.A[...] = out.A
-        if not joint.is_dense:  # else these are views
-            state.observer.a[joint.active] = x.a
-            for column, changed in zip(columns, landmarks, strict=True):
-                column[rows] = changed[places]
-            joint.follow(out.moved)
+        for column, changed in zip((state.observer.a, *columns), (x.a, *landmarks), strict=True):
+            joint.put_back(column, changed)
+        joint.follow(out.moved)
         calibration, p = state.calibration, state.axes.p
         if calibration.count:
             calibration.shift(out.moved[p : p + calibration.count])
@@ -224,8 +215,16 @@ def correct(
     return Corrected(status, rows, seen, out, factors)
 
 
+def _at_rest(state: State) -> JointCovariance | None:
+    """Return P, where landmarks are estimated, and are at rest."""
+    errors = state.errors
+    if errors is None or not errors.joint.is_at_rest or state.observer.have_moved:
+        return None
+    return errors.joint
+
+
 def _estimate(state: State, joint: JointCovariance) -> Estimate:
-    """Return the estimate as plain arrays, of a state that :func:`_is_at_rest`."""
+    """Return the estimate as plain arrays, of landmarks :func:`_at_rest`."""
     observer, matrix, active = state.observer, joint._matrix, joint.active
     return _estimate_of(
         state,
@@ -234,12 +233,6 @@ def _estimate(state: State, joint: JointCovariance) -> Estimate:
         matrix._storage,
         (matrix._size, joint.first, joint.chart.stride),
     )
-
-
-def _is_at_rest(state: State, joint: JointCovariance) -> bool:
-    """Return whether landmarks are estimated, and are at rest."""
-    is_exact = isinstance(joint, ExactMapCovariance)
-    return not (is_exact or joint.chart.velocity or state.observer.have_moved)
 
 
 def _estimate_of(

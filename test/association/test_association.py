@@ -19,16 +19,11 @@ from slam_observer_ros.association.joint_compatibility import (
     Pairs,
     PRUNING_COST,
 )
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, is_automatic
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import (
-    FIRST_AUTOMATIC_ID,
-    is_automatic,
-    ObservationEvent,
-    UNKNOWN_ID,
-    VelocityEvent,
-)
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.designs import make_gains

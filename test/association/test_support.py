@@ -10,10 +10,11 @@ from numpy.testing import assert_allclose
 import pytest
 
 from slam_observer_ros.association.hypothesis import FieldOfView, Visibility
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.state.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM
+from slam_observer_ros.observer.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM
 from slam_observer_ros.state.state import State
 
 
@@ -58,7 +59,9 @@ def looked_at(counts, looks, settled_looks=0, settled_seen=0):
     The landmark of row 0 is that one, the next are those of ``counts`` and ``looks``.
     """
     landmarks = LandmarkTable()
+    landmarks.append_zeros(1)
     landmarks.add_known(np.array([FIRST_AUTOMATIC_ID]), np.array([100]))
+    landmarks.append_zeros(len(counts))
     landmarks.add(FIRST_AUTOMATIC_ID + 1 + np.arange(len(counts)), 0)
     landmarks.counts[1:] = counts
     for look in range(settled_looks):
@@ -109,6 +112,7 @@ def test_nothing_is_forgotten_before_it_is_known_how_often_a_landmark_is_seen():
 def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_before():
     """One has settled, and was seen each time; the other one never was but once."""
     landmarks, both = LandmarkTable(), np.array([0, 1])
+    landmarks.append_zeros(2)
     landmarks.add(FIRST_AUTOMATIC_ID + both, 0)
     landmarks.note_in_view(both, np.array([True, True]))
     for look in range(1, 3 * PATIENCE):
@@ -123,12 +127,13 @@ def state_of(landmarks, points):
     """A state with these landmarks (n, 3), of which the table says what was seen of them."""
     state = State(make_gains(PLANAR, np.eye(4)), PLANAR)
     state.gains.add_known(KnownLandmarks(points, np.tile(np.eye(3), (len(points), 1, 1))))
-    state.landmarks = landmarks
+    state.landmarks = state.observer.landmarks = landmarks
     return state
 
 
 def test_before_it_is_known_where_a_sensor_looks_no_place_is_unexpected():
     landmarks, visibility = LandmarkTable(), Visibility(2)
+    landmarks.append_zeros(3)
     landmarks.add_known(FIRST_AUTOMATIC_ID + np.arange(3), np.full(3, 100))
     state = state_of(landmarks, 5.0 * np.eye(3))
     for look in range(200):

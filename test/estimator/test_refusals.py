@@ -10,15 +10,14 @@ from numpy.testing import assert_array_equal
 import pytest
 
 from slam_observer_ros.common.errors import MapError, ParameterError
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, LAST_AUTOMATIC_ID
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator.checks import MAX_MEASURED
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import (
     AngularVelocityEvent,
-    FIRST_AUTOMATIC_ID,
     IMPOSSIBLE_ID,
-    LAST_AUTOMATIC_ID,
     ObservationEvent,
     VelocityEvent,
 )

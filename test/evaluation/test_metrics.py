@@ -9,11 +9,10 @@ import pytest
 from strategies import generators, poses
 
 from slam_observer_ros.common.errors import EvaluationError
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray
 from slam_observer_ros.evaluation import consistency, metrics
 from slam_observer_ros.evaluation.metrics import ConfigurationError, MAX_JOINT
 from slam_observer_ros.evaluation.trajectory import LandmarkTruth, Trajectory
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
 
 STAMPS_NS = np.arange(40) * 100_000_000

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.common.errors import EvaluationError
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray
 from slam_observer_ros.estimates import Innovations
 from slam_observer_ros.evaluation import map_plot, replay_plots, simulation_plots
 from slam_observer_ros.evaluation.consistency import nees_over_time
@@ -36,7 +36,6 @@ from slam_observer_ros.evaluation.metrics import (
     trajectory_errors,
 )
 from slam_observer_ros.evaluation.trajectory import LandmarkTruth, Trajectory
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.common.errors import MapError
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 

@@ -30,7 +30,8 @@ from sensor_msgs.msg import Imu, PointCloud2
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import decode_twist, ODOMETRY

@@ -13,9 +13,9 @@ from scipy.stats import chi2
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.observer.landmark_table import LandmarkTable
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.landmark_table import LandmarkTable
 
 ERROR_TIME_S = 0.5
 RATE_HZ = 10
@@ -124,6 +124,7 @@ def test_another_sensor_that_sees_at_the_same_instant_counts_like_the_first():
 
 def test_a_landmark_that_was_relocated_has_not_been_seen_before():
     landmarks, row = LandmarkTable(), np.array([0])
+    landmarks.append_zeros(1)
     landmarks.add(np.array([7]), 0)
     landmarks.accept(row, 10**9)
     assert landmarks.unseen_s(row, 2 * 10**9) == 1.0
@@ -135,10 +136,11 @@ def test_a_landmark_that_was_relocated_has_not_been_seen_before():
 
 def test_where_a_landmark_was_rejected_is_still_known_when_another_one_was_removed():
     landmarks, last = LandmarkTable(), np.array([2])
+    landmarks.append_zeros(3)
     landmarks.add(np.array([7, 8, 9]), 0)
     position, tolerance_m = np.array([[4.0, 5.0, 6.0]]), np.array([0.1])
     landmarks.reject(last, position, tolerance_m)
-    landmarks.remove(np.array([0]))
+    landmarks.delete(np.array([0]))
     assert landmarks.are_rejected_again(np.array([1]), position, tolerance_m).all()
     landmarks.reject(np.array([1]), position, tolerance_m)
     assert landmarks.rejections.tolist() == [0, 2]

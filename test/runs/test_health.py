@@ -16,12 +16,18 @@ from slam_observer_ros.common.findings import found, KINDS, Level
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.health import of_fit, of_left_out, of_rejections
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.parameter_table import table
 
 IMPERATIVES = re.compile(
     r'(add|check|do|drive|give|is|let|look|mind|only|record|resume|see|send|set|state|synchronise|'
     r'to keep|try|use|has|are|did|if|some|max_landmarks|where)\b'
 )
 """How a remedy begins: it says what to do, or asks what to look at."""
+
+
+VALUES = {'true': True, 'false': False}
 
 
 class Figure:
@@ -108,8 +114,22 @@ def test_log_json_report_and_recorded_diagnostics_say_the_same(wild, tmp_path, s
         assert text not in numbers['warnings']
 
 
-@pytest.mark.parametrize('folder', ['recording', 'inputs', 'messages'])
-def test_what_inputs_complain_of_is_a_finding(folder):
+@pytest.mark.parametrize(
+    'folder',
+    ['recording', 'inputs', 'messages', 'estimator', 'association', 'known_map', 'smoothing'],
+)
+def test_what_is_logged_below_the_command_line_is_a_finding(folder):
     for path in (Path(slam_observer_ros.__file__).parent / folder).glob('*.py'):
-        said = re.findall(r'logger\.warning\((.*)', path.read_text(encoding='utf-8'))
-        assert all(re.match("'%s', (found\\(|finding\\))", words) for words in said), path
+        said = re.findall(r'logger\.(?:warning|error)\((.*)', path.read_text(encoding='utf-8'))
+        is_finding = re.compile(r"'%s', (found\(|finding\)|self\.problem\()")
+        assert all(is_finding.match(words) for words in said), path
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_what_a_remedy_says_to_set_can_be_set(kind):
+    """Names of parameters are those of the tables, and values fit them."""
+    rows = {row.name: row for owner in (Settings, ObserverNodeSettings) for row in table(owner)}
+    remedy = KINDS[kind].remedy
+    for name, value in re.findall(r'\b([a-z]+(?:_[a-z]+)+): (\w[\w.]*)', remedy):
+        assert name in rows, name
+        rows[name].check(VALUES.get(value, value) if value[0].isalpha() else float(value))

@@ -59,7 +59,7 @@ def known_of(estimator):
     known = [observer.A, observer.points, observer.u, state.calibration.values]
     known += [state.gains.joint_covariance(rows), state.landmark_covariances()]
     known += [getattr(state.landmarks, name) for name in state.landmarks.COLUMNS]
-    if state.relinearisation is not None:
+    if state.relinearisation.is_active:
         known += [np.array(state.relinearisation.history.poses)]
     return [None if array is None else np.array(array) for array in known]
 

@@ -79,7 +79,7 @@ def test_landmarks_that_may_move_are_points_and_it_is_said(caplog):
     estimator = Estimator(replace(SETTINGS, landmark_velocity_stddev=0.1))
     assert estimator._state.gains.tags is None
     (message,) = caplog.messages
-    assert message.startswith('use_tag_orientation has no effect')
+    assert message.startswith('No effect of use_tag_orientation')
     assert 'set landmark_velocity_stddev: 0.0' in message
 
 

@@ -10,8 +10,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from slam_observer_ros.common.findings import Finding, found, Level
-from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import is_automatic
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
@@ -42,7 +42,7 @@ class DiagnosticsPublisher:
     def __init__(
         self,
         node: GuardedNode,
-        estimator: Estimator,
+        estimator: Estimate,
         feed: EstimatorFeed,
         inputs: Sequence[InputTopic[Any]],
         estimate_publisher: EstimatePublisher,

@@ -15,7 +15,7 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.common.stamps import is_due, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.inputs.frames import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.clouds import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import (
@@ -95,7 +95,7 @@ class EstimatePublisher:
         self,
         node: Node,
         settings: ObserverNodeSettings,
-        estimator: Estimator,
+        estimator: Estimate,
         buffer: TransformBuffer,
     ) -> None:
         self._node = node

@@ -12,7 +12,7 @@ from std_msgs.msg import Bool
 from slam_observer_ros.common.findings import Finding, Level
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
-from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.ros_interface import LATCHED_QOS
 from slam_observer_ros.runs.health import of_fit
@@ -59,7 +59,7 @@ class LocalisationStatus:
     """Judges the standard deviations of position and heading; publishes ``~/is_localised``."""
 
     def __init__(
-        self, node: Node, settings: ObserverNodeSettings, estimator: Estimator, noise: NoiseFit
+        self, node: Node, settings: ObserverNodeSettings, estimator: Estimate, noise: NoiseFit
     ) -> None:
         self._node = node
         self._settings = settings

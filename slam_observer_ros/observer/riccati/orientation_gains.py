@@ -39,6 +39,27 @@ class OrientationGains(Gains):
         self.errors.joint = joint
 
     @property
+    def takes_all(self) -> bool:
+        """Whether all landmarks are in P."""
+        return self.joint.is_dense
+
+    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
+        return self.errors.joint_covariance(rows)
+
+    def landmark_covariance(self, rows: IntArray, tags: IntArray) -> FloatArray | None:
+        """Return that (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,); or None."""
+        return self.joint.of_landmarks(rows, self.observer.points[rows], tags)
+
+    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
+        """Return the joint covariance (m k, m k) of residuals, noise included."""
+        return self.errors.innovation_covariance(residuals)
+
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        return self.errors.distances(residuals)
+
+    @property
     def tags(self) -> TagGains | None:
         """Itself, where orientations are estimated."""
         return self if self.joint.chart.turn else None

@@ -90,6 +90,10 @@ class RiccatiGains(OrientationGains):
         self.joint.propagate(motion, points, observer.u[active])
         self.motion_noise.factors.move(motion.noise_by_kind)
 
+    def activate(self, rows: IntArray) -> None:
+        """See to it that landmarks (m,) are in P."""
+        self.joint.activate(rows)
+
     def residuals(
         self,
         rows: IntArray,
@@ -258,6 +262,7 @@ class RiccatiGains(OrientationGains):
         if square <= most:
             joint.update(HP, S, r)
             self._move(-x)
+            self.observer.landmarks.merge(rows, copies)
             self.remove(copies)
             self.observer.set_reference(self.observer.points)
         self._compress_if_large(0)

@@ -7,8 +7,13 @@ from typing import ClassVar
 import numpy as np
 
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, LandmarkColumns
-from slam_observer_ros.events import is_automatic
+from slam_observer_ros.common.types import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    is_automatic,
+    LandmarkColumns,
+)
 
 PATIENCE = 4
 """How many times as often others must have been seen before a landmark has had its chance.
@@ -89,15 +94,15 @@ class LandmarkTable(LandmarkColumns):
         return rows if np.count_nonzero(is_known) == len(ids) else np.where(is_known, rows, -1)
 
     def add(self, ids: IntArray, stamp_ns: int) -> None:
-        """Append landmarks (m,) that are seen for the first time."""
-        rows = self.append_zeros(len(ids))
+        """Let the last m landmarks, which have just been appended, be seen for the first time."""
+        rows = np.arange(len(self) - len(ids), len(self))
         self.ids[rows] = ids
         self.take_for_new(rows, stamp_ns)
         self._sort()
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
-        """Append landmarks (m,) that were seen ``counts`` (m,) times before this run."""
-        n = len(self)
+        """Let the last m landmarks be ones that were seen ``counts`` (m,) times before."""
+        n = len(self) - len(ids)
         self.add(ids, -1)
         self.counts[n:] = counts
         self.tentative[n:] = False
@@ -248,7 +253,7 @@ class LandmarkTable(LandmarkColumns):
         self.in_view[rows] = self.passed[rows] = self.missed[rows] = 0
 
     def merge(self, rows: IntArray, copies: IntArray) -> None:
-        """Count what was seen of ``copies`` (m,) for ``rows`` (m,), and delete the copies."""
+        """Count what was seen of ``copies`` (m,), which are about to go, for ``rows`` (m,)."""
         for counted in (self.counts, self.in_view, self.passed):
             counted[rows] += counted[copies]
         is_later = self.last_seen_ns[copies] > self.last_seen_ns[rows]
@@ -257,9 +262,8 @@ class LandmarkTable(LandmarkColumns):
             column[later] = column[latest]
         self.rejections[rows] = 0
         self.tentative[rows] &= self.tentative[copies]
-        self.remove(copies)
 
-    def remove(self, rows: IntArray) -> None:
+    def delete(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""
-        self.delete(rows)
+        super().delete(rows)
         self._sort()
