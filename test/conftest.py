@@ -60,16 +60,22 @@ settings.load_profile('suite')
 
 
 LONGEST = (
-    'test_cli_replay',
     'test_real_recordings',
-    'test_large_maps',
+    'test_ament_style',
     'test_batch',
+    'test_live_settings',
     'test_association',
+    'test_slip',
+    'test_calibration',
+    'test_large_maps',
     'test_batch_cluster',
     'test_map_replay',
+    'test_cli_replay',
+    'test_replay_outputs',
     'test_report',
-    'test_live_settings',
-    'test_map_localisation',
+    'test_plots',
+    'test_smoothing',
+    'test_given_poses',
     'test_scheduled',
 )
 """Files that take longest, of those without nodes: they begin early, so that none ends alone."""

@@ -60,7 +60,8 @@ def _summary(output, name):
 
 def test_demo_converges_and_leaves_figures_and_a_recording(tmp_path):
     (tmp_path / 'run_1').mkdir()
-    code, output = run_demo(tmp_path, '--real-time-factor', '10', '--duration', '70')
+    # No faster than people run it: where velocities come long before landmarks, L seems to lag.
+    code, output = run_demo(tmp_path, '--duration', '70')
     assert code == 0, output
     assert _summary(output, 'log10 L at 60 s') < -10.0
     assert _summary(output, 'slope of log10 L') == pytest.approx(-0.217, abs=0.005)
