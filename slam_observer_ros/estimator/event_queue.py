@@ -120,13 +120,13 @@ class EventQueue:
     def passes(self, event: Queued) -> bool:
         """Take an event that need not wait, and nothing waits for; return whether it is one.
 
-        That is what :meth:`push` and :meth:`pop_ready` do with an event that is in time and the
-        newest of all, where none has been late.
+        That is what :meth:`push` and :meth:`pop_ready` do with an event that is in time and
+        before none, where none has been late.
         """
         newest_ns = self.newest_ns
         if newest_ns is None or self._window.length_ns or self._events.held:
             return False
-        if not 0 < event.stamp_ns - newest_ns <= self._usual_ns:
+        if not 0 <= event.stamp_ns - newest_ns <= self._usual_ns:
             return False
         if not self._events.note(_keys(event), newest_ns - self._reach_ns):
             return False
