@@ -37,10 +37,9 @@ from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
-from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
+from slam_observer_ros.smoothing.keyframes import confirmed_slips, Keyframes, Solution
 from slam_observer_ros.smoothing.observations import SensedPoints
 from slam_observer_ros.smoothing.prior import Prior
-from slam_observer_ros.smoothing.slips import confirmed_slips
 
 logger = logging.getLogger(__name__)
 
@@ -274,7 +273,7 @@ class Relinearisation(Past):
             self._clear_counts()
 
     def smooth(self) -> tuple[Step, int, History]:
-        """Return the last step of smoothing, and how many slips it confirms (:mod:`.slips`).
+        """Return the last step of smoothing, and how many slips it confirms.
 
         Its estimates are iterated from the present ones, which stay as they are.
         """
