@@ -33,14 +33,14 @@ from slam_observer_ros.smoothing.bordered_chain import (
     landmark_columns,
     sum_by,
 )
-from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
+from slam_observer_ros.smoothing.keyframes import inverse, Keyframes, Solution
 from slam_observer_ros.smoothing.observations import (
     NO_SENSORS,
     normal,
     Observations,
     SensedPoints,
 )
-from slam_observer_ros.smoothing.prior import inverse, Prior
+from slam_observer_ros.smoothing.prior import Prior
 
 
 @dataclass(frozen=True, slots=True)

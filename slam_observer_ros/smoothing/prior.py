@@ -11,14 +11,12 @@ from scipy.linalg import block_diag
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import definite_inverse, solve_definite, transpose
+from slam_observer_ros.geometry.matrices import solve_definite, transpose
 from slam_observer_ros.observer.arrays import UNKNOWN_RAD
+from slam_observer_ros.smoothing.keyframes import EXACT_M
 
 ANYWHERE_M = 1e3
 """Standard deviation of an unknown landmark, metres."""
-
-EXACT_M = 1e-6
-"""Standard deviation of a position that is said to be exact, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,14 +202,6 @@ class Prior:
         """Return which of the landmarks (m,) were known, and their columns."""
         known, k = rows[rows < len(self.points)], self._unknowns(axes)
         return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()
-
-
-def inverse(covariances: FloatArray) -> FloatArray:
-    """Return inverses of covariances (…, d, d); an exact position counts as known to EXACT_M."""
-    known = covariances + EXACT_M**2 * np.eye(covariances.shape[-1])
-    if known.ndim == 2:
-        return definite_inverse(known)
-    return np.asarray(np.linalg.inv(known), dtype=np.float64)
 
 
 def _with_unknown(covariance: FloatArray, columns: IntArray, sigma: float) -> FloatArray:

@@ -37,10 +37,9 @@ from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
-from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
+from slam_observer_ros.smoothing.keyframes import confirmed_slips, Keyframes, Solution
 from slam_observer_ros.smoothing.observations import SensedPoints
 from slam_observer_ros.smoothing.prior import Prior
-from slam_observer_ros.smoothing.slips import confirmed_slips
 
 logger = logging.getLogger(__name__)
 
@@ -87,17 +86,17 @@ class KnownErrors(Protocol):
 
 
 class Owner(Protocol):
-    """What keeps a past beside its estimate."""
+    """A state, which keeps a past beside its estimate."""
 
     calibration: Calibration
 
     @property
     def known_errors(self) -> KnownErrors:
-        """What is known of the errors, where anything is relinearised."""
+        """The errors, which are known where anything is relinearised."""
 
 
 class Past:
-    """What was seen by a filter that linearises none of it again, and keeps nothing."""
+    """The past of a filter that relinearises nothing: nothing of it is kept."""
 
     @property
     def is_active(self) -> bool:
@@ -131,7 +130,7 @@ class Past:
         """Add a keyframe, of a landmark ``in_doubt`` or none."""
 
     def add_calibration(self) -> None:
-        """Note what is estimated of the calibration from now on, beside what was so far."""
+        """Note entries of the calibration that are estimated from now on."""
 
     def relocate(self, rows: IntArray) -> None:
         """Forget all about landmarks (m,) but their latest observation."""
@@ -274,7 +273,7 @@ class Relinearisation(Past):
             self._clear_counts()
 
     def smooth(self) -> tuple[Step, int, History]:
-        """Return the last step of smoothing, and how many slips it confirms (:mod:`.slips`).
+        """Return the last step of smoothing, and how many slips it confirms.
 
         Its estimates are iterated from the present ones, which stay as they are.
         """
@@ -321,7 +320,7 @@ class Relinearisation(Past):
 
     @property
     def _is_dense(self) -> bool:
-        """Whether what is relinearised can be taken over: P has all landmarks."""
+        """Whether P has all landmarks, so that it can take over a relinearised map."""
         return self._joint.is_dense
 
     def _start(self, prior: Prior, since: str) -> None:
