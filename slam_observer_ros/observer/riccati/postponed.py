@@ -17,11 +17,12 @@ over many corrections D₁ a + T X_i, with a tensor T. A tag's orientation turns
 time. See docs/theory.md, Large maps.
 
 cov(η) is large, and such products of low rank are added to it a little at a time: it is a
-:class:`PanelMatrix` M = B + U diag(w) Uᵀ, with a B of its own. Its rows are in panels. B is kept up
-to its diagonal, in square tiles: so it grows without a copy, and takes half the memory. Adding
-U diag(w) Uᵀ to B costs O(N²) for N rows, and is done panel by panel (:meth:`PanelMatrix.fold`). U
-grows panel by panel, too: columns that are *begun* have been given to some panels, and M is what it
-was before in the others. No array is changed in place: copies share them.
+:class:`PanelMatrix` M = B + U diag(w) Uᵀ, with a B of its own. Its rows are in panels. B is kept
+up to its diagonal, in square tiles: so it grows without a copy, and takes half the memory.
+Adding U diag(w) Uᵀ to B costs O(N²) for N rows, and is done panel by panel
+(:meth:`PanelMatrix.fold`). U grows panel by panel, too: columns that are *begun* have been given
+to some panels, and M is what it was before in the others. No array is changed in place: copies
+share them.
 """
 
 from __future__ import annotations
