@@ -48,7 +48,7 @@ MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
 
 NEARLY = 1.0 - 1e-9
-"""Of a limit: what is below that is below the limit, however it is rounded."""
+"""Share of a limit below which a value is below the limit, however it is rounded."""
 
 MAX_WEIGHED = 100
 """Points of one observation that are weighed against landmarks without ids, at most.

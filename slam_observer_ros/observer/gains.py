@@ -258,7 +258,7 @@ class Gains(ABC):
 
     @property
     def takes_all(self) -> bool:
-        """Whether an observation changes what is known of all landmarks, however many."""
+        """Whether an observation changes the covariances of all landmarks, however many."""
         return False
 
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:

@@ -16,7 +16,7 @@ from slam_observer_ros.common.types import (
 )
 
 PATIENCE = 4
-"""How many times as often others must have been seen before a landmark has had its chance.
+"""A landmark has had its chance when others in view as often were seen so many times as often.
 
 Some are seen more seldom than others: from afar, or from one side only.
 """
@@ -25,8 +25,8 @@ TOO_SELDOM = 5
 """How many times more seldom than others a landmark may be seen that was confirmed once."""
 
 MIN_SHARE, MOST_SHARE = 0.1, 0.9
-"""How often a landmark in view is seen at least, as in a map that was loaded, and at most: one
-that was seen each time may yet be hidden.
+"""Least and greatest share of observations in which a landmark in view is seen: of a loaded map
+it may be small, and a landmark that was seen each time may yet be hidden.
 """
 
 NEW_S, OLD_S = 60.0, 20.0
@@ -65,11 +65,11 @@ class LandmarkTable(LandmarkColumns):
     last_seen_ns: IntArray
     seen_before_ns: IntArray
     tentative: BoolArray  # (n,) which have no id, and have yet to be seen often enough to stay
-    # (n,) observations without ids that had it in view, and those since the one that saw it
+    # (n,) observations without ids that had it in view, and how many since it was seen
     in_view: IntArray
     missed: IntArray
-    # (n,) those from another place than the one before: what hides one from a robot that stands
-    # hides it in all of them
+    # (n,) how many of them were from another place than the one before: from a robot that stands a
+    # landmark may be hidden in all of them
     passed: IntArray
     # (n,) stamp at which each was seen for the first time; −1 for one that a map had
     born_ns: IntArray
@@ -131,8 +131,8 @@ class LandmarkTable(LandmarkColumns):
     def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
         """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
 
-        What is seen twice at one stamp is seen by two sensors: the second has not seen it for as
-        long as the first one had not.
+        Two observations of one stamp are of two sensors: at the second a landmark was unseen for
+        as long as at the first.
         """
         since_ns = self.last_seen_ns.take(rows)
         is_seen_now = since_ns == stamp_ns
@@ -215,7 +215,7 @@ class LandmarkTable(LandmarkColumns):
 
     @property
     def likely_share(self) -> float:
-        """The same, within what is likely."""
+        """:attr:`seen_share` within likely limits."""
         return min(max(self.seen_share, MIN_SHARE), MOST_SHARE)
 
     def unsupported(self, min_support: int) -> IntArray:

@@ -105,7 +105,7 @@ class Observer(FilterArrays):
         self.orientations.clear(rows)
 
     def fix_landmarks(self, y_ref: FloatArray) -> None:
-        """Put all landmarks at ``y_ref`` (n + m, 3), m of which are new, at rest, for good."""
+        """Put all landmarks at ``y_ref`` (n + m, 3), at rest and for good; the last m are new."""
         self.append_zeros(len(y_ref) - len(self))
         self.set_reference(y_ref)
         self.u[...] = 0.0

@@ -86,17 +86,17 @@ class KnownErrors(Protocol):
 
 
 class Owner(Protocol):
-    """What keeps a past beside its estimate."""
+    """A state, which keeps a past beside its estimate."""
 
     calibration: Calibration
 
     @property
     def known_errors(self) -> KnownErrors:
-        """What is known of the errors, where anything is relinearised."""
+        """The errors, which are known where anything is relinearised."""
 
 
 class Past:
-    """What was seen by a filter that linearises none of it again, and keeps nothing."""
+    """The past of a filter that relinearises nothing: nothing of it is kept."""
 
     @property
     def is_active(self) -> bool:
@@ -130,7 +130,7 @@ class Past:
         """Add a keyframe, of a landmark ``in_doubt`` or none."""
 
     def add_calibration(self) -> None:
-        """Note what is estimated of the calibration from now on, beside what was so far."""
+        """Note entries of the calibration that are estimated from now on."""
 
     def relocate(self, rows: IntArray) -> None:
         """Forget all about landmarks (m,) but their latest observation."""
@@ -320,7 +320,7 @@ class Relinearisation(Past):
 
     @property
     def _is_dense(self) -> bool:
-        """Whether what is relinearised can be taken over: P has all landmarks."""
+        """Whether P has all landmarks, so that it can take over a relinearised map."""
         return self._joint.is_dense
 
     def _start(self, prior: Prior, since: str) -> None:

@@ -23,10 +23,10 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.riccati import outside_landmarks, panel_matrix
+from slam_observer_ros.observer.riccati import outside_landmarks, postponed
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize, CHECK_INTERVAL
 from slam_observer_ros.observer.riccati.following_landmarks import REFERENCE_SHIFT_M
-from slam_observer_ros.observer.riccati.panel_matrix import PanelMatrix
+from slam_observer_ros.observer.riccati.postponed import PanelMatrix
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 
 VIEW_M = 6.0
@@ -42,7 +42,7 @@ PLANAR_TAGS = replace(TAGS, two_d_mode=True)
 @pytest.fixture(autouse=True)
 def _many_panels(monkeypatch):
     """So that a change has come to some of them only, most of the time."""
-    for module in (panel_matrix, outside_landmarks):
+    for module in (postponed, outside_landmarks):
         monkeypatch.setattr(module, 'PANEL_ROWS', 12)
 
 
@@ -270,7 +270,7 @@ def test_references_follow_estimates_that_are_corrected_by_more_than_a_tolerance
 def test_what_is_pending_comes_to_the_panels_a_little_at_a_time():
     """Products of low rank begin, and each panel is given its rows at some later time."""
     rng, matrix, M = np.random.default_rng(0), PanelMatrix(), np.zeros((0, 0))
-    rows = panel_matrix.PANEL_ROWS
+    rows = postponed.PANEL_ROWS
     for number in range(40):
         if number < 5:
             matrix.append()

@@ -1,7 +1,7 @@
 """Active landmarks of a large map, which are in P, and how others take their place.
 
 Motions and observations change P alone. Their effect on all other landmarks is gathered in columns
-of P that nothing else acts on, and comes later: see :mod:`.postponed_correction`.
+of P that nothing else acts on, and comes later: see :mod:`.postponed`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from slam_observer_ros.observer.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
 from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
-from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
+from slam_observer_ros.observer.riccati.postponed import PostponedCorrection
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -18,7 +18,7 @@ from slam_observer_ros.observer.riccati.outside_landmarks import (
     OutsideLandmarks,
     View,
 )
-from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
+from slam_observer_ros.observer.riccati.postponed import PostponedCorrection
 
 REFERENCE_SHIFT_M = 0.1
 """How far estimates of landmarks out of view may be from their references."""

@@ -16,8 +16,11 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
 from slam_observer_ros.observer.chart import Chart
-from slam_observer_ros.observer.riccati.panel_matrix import PANEL_ROWS, PanelMatrix
-from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
+from slam_observer_ros.observer.riccati.postponed import (
+    PANEL_ROWS,
+    PanelMatrix,
+    PostponedCorrection,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
