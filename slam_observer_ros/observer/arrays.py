@@ -149,7 +149,7 @@ class SymmetricMatrix:
         return self._storage[: self._size, : self._size]
 
     def rows(self, numbers: IntArray) -> FloatArray:
-        """Return the rows (q, N) with these ``numbers`` (q,); transposed they are columns."""
+        """Return the (q, N) of these ``numbers`` (q,) of rows; transposed they are columns."""
         # Of the storage, which is contiguous: of a view NumPy would copy all first.
         return self._storage.take(numbers, axis=0)[:, : self._size]
 

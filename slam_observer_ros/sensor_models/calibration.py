@@ -253,8 +253,9 @@ class Calibration:
         """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
 
         It follows from ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay that is too long by τ̃, by which
-        velocities were taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6)
-        holds the estimated rows of Ad_Â; the other arguments are as in :class:`.Motion`.
+        velocities were taken from an interval that begins and ends τ̃ earlier. ``Ad``
+        (k + 1, p, 6) holds the estimated rows of Ad_Â; the other arguments are as in
+        :class:`.Motion`.
         """
         if not self.count:
             return np.empty((Ad.shape[1], 0))
