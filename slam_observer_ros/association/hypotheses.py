@@ -41,7 +41,7 @@ from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.integration import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import in_parts, usual
-from slam_observer_ros.state.matching import corrected, match, MatchedObservation
+from slam_observer_ros.state.matching import calibrated, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, step
 
@@ -357,10 +357,10 @@ class Hypotheses:
         Of several, one that contradicts what it said before is given up, unless it is the best.
         """
         state, index = hypothesis.state, hypothesis.index
-        seen = corrected(state, event)
+        seen = calibrated(state, event)
         if matched is not None:
             return interpretations(state, index, seen, matched, new_ids, new_cost, budget, True)
-        used = in_parts.observe(state, event, is_weighed=True)
+        used = in_parts.observe(state, event, with_expected=True)
         if used is not None:
             found = [as_its_ids_say(state, seen, *used)]
         else:

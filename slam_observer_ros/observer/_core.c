@@ -727,8 +727,8 @@ static void stated_covariance(const double y[3], const double stated[9], const d
 }
 
 /* y = o + d + exp(psi) e^s p of a point, where its sensor was, and its stated covariance. */
-static void corrected(const Seen *seen, long i, const double turned[9], int is_planar,
-                      double y[3], double origin[3], double stated[9]) {
+static void calibrated_point(const Seen *seen, long i, const double turned[9], int is_planar,
+                             double y[3], double origin[3], double stated[9]) {
     const double *arm = seen->arms + 3 * i;
     for (int b = 0; b < 3; b++)
         origin[b] = seen->origins ? seen->origins[3 * i + b] : 0.0;
@@ -809,7 +809,7 @@ static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen 
             return 0;
         double *y = out->points + 3 * i, *r = out->r + 3 * i, *origin = out->origins + 3 * i;
         double *stated = res->stated + 9 * i, from_robot[3], expected[3], arm[3], line[3], C[9];
-        corrected(seen, i, turned, x->is_planar, y, origin, stated);
+        calibrated_point(seen, i, turned, x->is_planar, y, origin, stated);
         turn(pose.R, y, r);
         for (int b = 0; b < 3; b++) {
             double point = x->y_ref[3 * row + b] + x->a[3 * row + b];

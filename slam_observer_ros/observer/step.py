@@ -316,7 +316,7 @@ def _residuals(
         return None
     axes, R_hat, x_hat = axes_of(x.is_planar), x.A[:3, :3], x.A[:3, 3]
     k = axes.point
-    y, origins, stated = _corrected(seen, x.is_planar)
+    y, origins, stated = _calibrated(seen, x.is_planar)
     points = x.y_ref.take(rows, axis=0) + x.a.take(rows, axis=0)
     # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     r = y.dot(R_hat.T) + x_hat - points
@@ -351,7 +351,7 @@ def _residuals(
     )
 
 
-def _corrected(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+def _calibrated(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Return points y (m, 3) by the calibration of their sensor, and where that was (m, 3).
 
     And their covariances (m, 3, 3) where these are stated.

@@ -29,7 +29,7 @@ _ALONG_X = np.array([1.0, 0.0, 0.0])
 _TINY = np.finfo(np.float64).tiny
 
 
-def corrected(
+def calibrated(
     calibration: Calibration, settings: Settings, event: ObservationEvent
 ) -> ObservationEvent:
     """Return an observation as it is by the calibration of its sensor; keep what that showed.
@@ -53,11 +53,11 @@ def corrected(
     if velocities is not None:
         velocities = velocities @ R.T
     event = replace(event, covariances=covariances, velocities=velocities, sensed=sensed)
-    return corrected_again(calibration, event)
+    return calibrated_again(calibration, event)
 
 
-def corrected_again(calibration: Calibration, event: ObservationEvent) -> ObservationEvent:
-    """Return a corrected observation as it is by the calibration now."""
+def calibrated_again(calibration: Calibration, event: ObservationEvent) -> ObservationEvent:
+    """Return a calibrated observation as it is by the calibration now."""
     sensed, Z = event.sensed, event.orientations
     if sensed is None:
         return event
@@ -76,7 +76,7 @@ def corrected_again(calibration: Calibration, event: ObservationEvent) -> Observ
 def point_sensitivity(
     calibration: Calibration, event: ObservationEvent, points: FloatArray
 ) -> FloatArray | None:
-    """Return D (m, 3, c) at ``points`` (m, 3) of a corrected observation, body frame; or None."""
+    """Return D (m, 3, c) at ``points`` (m, 3) of a calibrated observation, body frame; or None."""
     if event.sensed is None or event.sensor is None or not calibration.calibrates_sensors:
         return None
     frame, D = event.sensor_frame, np.zeros((len(points), 3, calibration.count))

@@ -14,7 +14,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.observer.step import DONE, REJECTS
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import (
-    corrected,
+    calibrated,
     enter,
     Expected,
     is_contradiction,
@@ -26,25 +26,25 @@ from slam_observer_ros.state.usual import Corrected, NO_IDS
 
 
 def observe(
-    state: State, event: ObservationEvent, is_weighed: bool = False
+    state: State, event: ObservationEvent, with_expected: bool = False
 ) -> tuple[Update, Expected | None] | None:
     """Let a state use an observation (28)–(31) made at its instant.
 
-    Return what that did, and what was expected of the points used, if the observation
-    ``is_weighed``. Return None, with nothing changed, where the usual step is not possible.
+    Return what that did, and ``with_expected`` what was expected of the points used. Return None,
+    with nothing changed, where the usual step is not possible.
     """
     rows = state.landmarks.rows_of(event.ids)
     known = rows >= 0
-    if not usual.takes(state, event):
+    if not usual.is_usual(state, event):
         return None
     if not len(rows) or np.count_nonzero(known) < len(rows):
-        return _in_parts(state, event, rows, known, None, is_weighed)
-    of_all = usual.correct(state, event, rows, is_weighed)
+        return _in_parts(state, event, rows, known, None, with_expected)
+    of_all = usual.correct(state, event, rows, with_expected)
     if of_all is None:
         return None
     if of_all.status == DONE:  # as nearly always
-        return usual.whole(state, event, of_all), usual.expected(state, of_all.out)
-    return _in_parts(state, event, rows, known, of_all, is_weighed)
+        return usual.finish(state, event, of_all), usual.expected(state, of_all.out)
+    return _in_parts(state, event, rows, known, of_all, with_expected)
 
 
 def _in_parts(
@@ -53,7 +53,7 @@ def _in_parts(
     rows: IntArray,
     known: BoolArray,
     of_all: Corrected | None,
-    is_weighed: bool,
+    with_expected: bool,
 ) -> tuple[Update, Expected | None] | None:
     """Use the points of ``known`` (m,) landmarks, as far as they are not rejected.
 
@@ -61,18 +61,18 @@ def _in_parts(
     """
     if not _may_enter(state, event.ids[~known]):
         return None
-    shown, used = corrected(state, event), known.copy()  # by the calibration before the step
+    shown, used = calibrated(state, event), known.copy()  # by the calibration before the step
     new = shown.select(~known)
     of_used = None
     if np.count_nonzero(known):
         if of_all is None:
-            of_all = usual.correct(state, event.select(known), rows[known], is_weighed)
+            of_all = usual.correct(state, event.select(known), rows[known], with_expected)
         of_used = of_all
         if of_all is not None and of_all.status == REJECTS:
             used[known] = of_all.out.weights > 0.0
             if not _may_leave_out(state, rows[known], ~used[known]):
                 return None
-            of_used = usual.correct(state, event.select(used), rows[used], is_weighed, of_all)
+            of_used = usual.correct(state, event.select(used), rows[used], with_expected, of_all)
         if of_all is None or of_used is None or of_used.status == REJECTS:
             return None
     rejected = known & ~used

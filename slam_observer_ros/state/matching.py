@@ -41,7 +41,7 @@ class MatchedObservation:
 
 def match(state: State, event: ObservationEvent) -> MatchedObservation:
     """Match an observation made at the state's instant with landmarks by their ids."""
-    event = corrected(state, event)
+    event = calibrated(state, event)
     m, rows = len(event.ids), state.landmarks.rows_of(event.ids)
     if not state.is_mapping:
         event, rows = mapped(state, event)
@@ -57,19 +57,19 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
     return MatchedObservation(event, rows, covariances, known, residuals, left_out)
 
 
-def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
-    """Return an observation corrected by the calibration of its sensor, if it is not yet."""
+def calibrated(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation by the calibration of its sensor, if it is not so yet."""
     calibration = state.calibration
     if not calibration.corrects_points or event.sensed is not None:
         return event
     if event.sensor_frame not in calibration.sensors:
         state.add_sensor(event.sensor_frame)
-    return sensing.corrected(calibration, state.settings, event)
+    return sensing.calibrated(calibration, state.settings, event)
 
 
-def corrected_again(state: State, event: ObservationEvent) -> ObservationEvent:
+def calibrated_again(state: State, event: ObservationEvent) -> ObservationEvent:
     """Return an observation by the present calibration, which a correction has changed."""
-    return sensing.corrected_again(state.calibration, event)
+    return sensing.calibrated_again(state.calibration, event)
 
 
 def sensitivity(
@@ -97,7 +97,7 @@ def enter(state: State, event: ObservationEvent, noise: FloatArray) -> None:
     m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
     state.counts['unmapped_landmark'] += new - m
     if m:
-        event = corrected_again(state, event.select(np.arange(new) < m))
+        event = calibrated_again(state, event.select(np.arange(new) < m))
         state.gains.add(event.points, noise[:m], sensitivity(state, event))
         state.landmarks.add(event.ids, event.stamp_ns)
 

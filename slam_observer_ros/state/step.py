@@ -19,7 +19,7 @@ from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.sensor_models.sensing import turn_sensitivity
 from slam_observer_ros.state.matching import (
-    corrected_again,
+    calibrated_again,
     enter,
     Expected,
     is_contradiction,
@@ -112,7 +112,7 @@ def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEven
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
     """Relocate doubtful landmarks that are still far off; return ids of landmarks that moved."""
-    event = corrected_again(state, event)
+    event = calibrated_again(state, event)
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
     gate = state.settings.rejection_threshold
@@ -185,7 +185,7 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
     tags.count(seen.rows[judged], weights[judged] > 0.0)
     state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
     covariances = matched.covariances[matched.rows >= 0]
-    event = corrected_again(state, event)
+    event = calibrated_again(state, event)
     residuals = residuals_of(state, event, rows, covariances)
     return replace(matched, known=event, residuals=residuals)
 
@@ -201,7 +201,7 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
         return
     in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     is_used = state.landmarks.rejections[rows] == 0
-    event = corrected_again(state, event)
+    event = calibrated_again(state, event)
     Z = Z if event.orientations is None else event.orientations
     seen = _seen(state, event, rows, Z, is_used & (in_doubt | ~tags.are_known[rows]))
     if not len(seen.rows):

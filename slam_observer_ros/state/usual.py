@@ -1,6 +1,7 @@
-"""The usual step over the arrays of a state, which takes over the results.
+"""A state packed into plain arrays for the usual step, and its results written back.
 
-All returns None, with no estimate changed, where anything is unusual: see :mod:`.observer.step`.
+Functions return None, with no estimate changed, where anything is unusual: see
+:mod:`.observer.step`.
 Of a large map only active landmarks are read; the landmarks seen have become active before.
 """
 
@@ -32,6 +33,7 @@ from slam_observer_ros.observer.robust import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.motion_noise import Factors
 from slam_observer_ros.sensor_models.velocity_history import Velocities, VelocityHistory
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.covariances import of_pose
 from slam_observer_ros.state.matching import Expected
@@ -128,7 +130,7 @@ class Corrected(NamedTuple):
     factors: Factors | None  # as learnt of the noise of the motion
 
 
-def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Update:
+def finish(state: State, event: ObservationEvent, corrected: Corrected) -> Update:
     """Keep a keyframe of an observation that has corrected a state by all its points."""
     past, out = state.relinearisation, corrected.out
     if past.is_active:
@@ -138,7 +140,7 @@ def whole(state: State, event: ObservationEvent, corrected: Corrected) -> Update
     return state.update(event.stamp_ns, event.ids, out.r, none_rejected, NO_IDS, judged)
 
 
-def takes(state: State, event: ObservationEvent) -> bool:
+def is_usual(state: State, event: ObservationEvent) -> bool:
     """Return whether a state is a map of points at rest, and the observation has points alone.
 
     It must be of the state's instant, by a sensor that is known.
@@ -158,61 +160,81 @@ def correct(
     state: State,
     event: ObservationEvent,
     rows: IntArray,
-    is_weighed: bool = False,
+    with_expected: bool = False,
     of_all: Corrected | None = None,
 ) -> Corrected | None:
     """Correct a state by points of known landmarks ``rows`` (m,), but keep no keyframe.
 
-    The observation is one that the state :func:`takes`, or the part of one that ``of_all`` has not
-    rejected. If it ``is_weighed``, the results have what was expected of the points.
+    The observation :func:`is_usual`, or it is the part of one that ``of_all`` has not rejected.
+    With ``with_expected`` the results have what was expected of the points.
     """
     m, k, joint = len(rows), state.axes.point, state.known_errors.joint
     if not 0 < m <= AT_ONCE or m * k * len(joint.P) ** 2 > MOST_WORK:
         return None
     joint.activate(rows)
-    x, places = _estimate(state, joint), joint.places(rows)
-    seen = _seen(state, event, places)
-    settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
-    factors = noise.flat() if of_all is None else None
-    out = Observed(
-        np.empty((4, 4)),
-        np.empty((m, 3)),
-        np.empty((m, 3)),
-        np.empty(m),
-        np.empty((m, 3)),
-        np.empty((m, 3)),
-        np.empty((0 if event.covariances is None else m, 3, 3)),
-        np.empty(m),
-        np.empty(x.first),
-        np.empty(3 * m + 1) if state.judges_innovations else _NO_ENTRIES,
-        np.empty(m * (m + 1) * k * k) if is_weighed else _NO_ENTRIES,
-    )
-    limits = Limits(
-        settings.rejection_threshold,
-        settings.huber_threshold,
-        settings.observation_correlation_time,
-        settings.confirmations,
-        settings.max_rejections,
-        settings.max_hypotheses > 1,
-    )
-    columns = table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns
-    landmarks = Landmarks(*(column[joint.active] for column in columns))
-    figures = state.observation_noise.figures
+    x, seen = _estimate(state, joint), _seen(state, event, joint.places(rows))
+    landmarks = Landmarks(*(column[joint.active] for column in _columns(state)))
+    factors = state.motion_noise.factors.flat() if of_all is None else None
+    out = _room(state, event, x, with_expected)
+    figures, limits = state.observation_noise.figures, _limits(state.settings)
     status = core.observe(x, landmarks, seen, figures, limits, factors, out)
     if status == step.UNUSUAL:
         return None
     if status == step.DONE:
-        noise.take(factors if of_all is None else of_all.factors)
-        state.relinearisation.note_correction(x.A, out.A)
-        x.A[...] = out.A
-        for column, changed in zip((state.observer.a, *columns), (x.a, *landmarks), strict=True):
-            joint.put_back(column, changed)
-        joint.follow(out.moved)
-        calibration, p = state.calibration, state.axes.p
-        if calibration.count:
-            calibration.shift(out.moved[p : p + calibration.count])
-        state.rejected_in_a_row, state.was_contradicted = 0, False
+        state.motion_noise.factors.take(factors if of_all is None else of_all.factors)
+        _take_over(state, joint, x, landmarks, out)
     return Corrected(status, rows, seen, out, factors)
+
+
+def _columns(state: State) -> tuple[IntArray, ...]:
+    """Return the columns of the landmark table that the kernel reads and changes."""
+    table = state.landmarks
+    return table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns
+
+
+def _room(state: State, event: ObservationEvent, x: Estimate, with_expected: bool) -> Observed:
+    """Return room for the results; none for those that nobody asks for."""
+    m, k = len(event.ids), state.axes.point
+    return Observed(
+        A=np.empty((4, 4)),
+        points=np.empty((m, 3)),
+        r=np.empty((m, 3)),
+        dt_s=np.empty(m),
+        lines_of_sight=np.empty((m, 3)),
+        origins=np.empty((m, 3)),
+        covariances=np.empty((0 if event.covariances is None else m, 3, 3)),
+        weights=np.empty(m),
+        moved=np.empty(x.first),
+        judged=np.empty(3 * m + 1) if state.judges_innovations else _NO_ENTRIES,
+        expected=np.empty(m * (m + 1) * k * k) if with_expected else _NO_ENTRIES,
+    )
+
+
+def _limits(settings: Settings) -> Limits:
+    return Limits(
+        gate=settings.rejection_threshold,
+        huber=settings.huber_threshold,
+        error_time_s=settings.observation_correlation_time,
+        confirmations=settings.confirmations,
+        max_rejections=settings.max_rejections,
+        weighs_meanings=settings.max_hypotheses > 1,
+    )
+
+
+def _take_over(
+    state: State, joint: JointCovariance, x: Estimate, landmarks: Landmarks, out: Observed
+) -> None:
+    """Let a state be as the kernel has left it: x, the landmarks' columns, what has moved."""
+    state.relinearisation.note_correction(x.A, out.A)
+    x.A[...] = out.A
+    columns = (state.observer.a, *_columns(state))
+    for column, changed in zip(columns, (x.a, *landmarks), strict=True):
+        joint.put_back(column, changed)
+    joint.follow(out.moved)
+    calibration, p = state.calibration, state.axes.p
+    if calibration.count:
+        calibration.shift(out.moved[p : p + calibration.count])
+    state.rejected_in_a_row, state.was_contradicted = 0, False
 
 
 def _at_rest(state: State) -> JointCovariance | None:

@@ -83,13 +83,13 @@ def test_derivatives_of_a_corrected_point_are_those_of_differences(settings, is_
     calibration = calibrated(settings)
     calibration.shift(0.1 * rng.normal(size=calibration.count))
     event = observation(rng, sensor=np.tile([0.3, 0.1, 0.5], (5, 1)))
-    seen, h = sensing.corrected(calibration, settings, event), 1e-6
+    seen, h = sensing.calibrated(calibration, settings, event), 1e-6
     D = sensing.point_sensitivity(calibration, seen, seen.points)
     for column, unit in enumerate(np.eye(calibration.count)):
         calibration.shift(h * unit)
-        after = sensing.corrected_again(calibration, seen).points
+        after = sensing.calibrated_again(calibration, seen).points
         calibration.shift(-2.0 * h * unit)
-        differences = (after - sensing.corrected_again(calibration, seen).points) / (2.0 * h)
+        differences = (after - sensing.calibrated_again(calibration, seen).points) / (2.0 * h)
         calibration.shift(h * unit)
         k = 2 if settings.two_d_mode else 3
         np.testing.assert_allclose(D[:, :k, column], differences[:, :k], atol=1e-8)
@@ -125,7 +125,7 @@ def test_a_depth_becomes_the_range_that_it_is_of(rng):
         ranges = np.linalg.norm(points, axis=1)
         shown = points * (along / ranges / 1.1)[:, None]
         event = ObservationEvent(1, np.arange(6), shown, sensor_axis=axis)
-        seen = sensing.corrected(calibrated(settings), settings, event)
+        seen = sensing.calibrated(calibrated(settings), settings, event)
         np.testing.assert_allclose(seen.points, points, atol=1e-12)
 
 
@@ -136,7 +136,7 @@ def test_what_a_message_states_turns_and_grows_with_the_point(rng):
     calibration.shift(np.array([0.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2])[-calibration.count :])
     own = np.diag([0.04, 0.01, 0.01])
     event = observation(rng, covariances=np.tile(own, (5, 1, 1)), velocities=np.eye(3)[[0] * 5])
-    seen = sensing.corrected(calibration, settings, event)
+    seen = sensing.calibrated(calibration, settings, event)
     expected = 1.5**2 * np.diag([0.01, 0.04, 0.01])
     np.testing.assert_allclose(seen.covariances[0], expected, atol=1e-12)
     np.testing.assert_allclose(seen.velocities[0], [0.0, 1.0, 0.0], atol=1e-12)
@@ -197,7 +197,7 @@ def test_the_range_scale_is_not_biased_by_noise(monkeypatch):
         return sensitivity(state, event)
 
     monkeypatch.setattr('slam_observer_ros.state.matching.sensitivity', at_the_point_measured)
-    monkeypatch.setattr('slam_observer_ros.state.usual.takes', lambda *_: False)
+    monkeypatch.setattr('slam_observer_ros.state.usual.is_usual', lambda *_: False)
     assert np.mean(range_scales(20)) < -6.0 / math.sqrt(20)
 
 

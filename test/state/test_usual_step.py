@@ -127,10 +127,10 @@ class BothWays:
             np.testing.assert_allclose(found[1], covariance, rtol=0, atol=1e-12 * size)
         return found
 
-    def observe(self, state, event, is_weighed=False):
+    def observe(self, state, event, with_expected=False):
         other = state.copy()
         self.observed += 1
-        used = self._observe(state, event, is_weighed)
+        used = self._observe(state, event, with_expected)
         if used is None:
             assert_same(state, other, 'an unusual observation')
             return None
@@ -138,7 +138,7 @@ class BothWays:
         is_whole = 0 < len(update.ids) == len(event.ids) and not update.rejected.any()
         self.used[usual if is_whole else in_parts] += 1
         matched = match(other, event)
-        if is_weighed:
+        if with_expected:
             cost = as_its_ids_say(state, event, update, weighed).cost
             assert cost == pytest.approx(pairing_cost(other, len(event.ids), matched.residuals))
         expected = step(other, matched)
