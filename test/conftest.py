@@ -65,7 +65,7 @@ LONGEST = (
     'test_batch',
     'test_live_settings',
     'test_association',
-    'test_costs',
+    'test_slip',
     'test_calibration',
     'test_large_maps',
     'test_batch_cluster',

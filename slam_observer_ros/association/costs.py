@@ -2,18 +2,10 @@
 
 A cost is −2 ln of a likelihood, as in :mod:`.joint_compatibility`. Costs of points add up, and the
 interpretation with the lowest sum is the likeliest one.
-
-One of them is that the robot is not where odometry has it: its wheels slipped, or someone carried
-it. Filters with a joint covariance weigh that as a hypothesis. For all other filters
-:class:`RejectedLandmarks` decides whether the pose is wrong, as observation after observation
-contradicts it: a rejected landmark may have moved, and a rejected observation may be garbled. The
-pose is wrong if three things come together: all landmarks of an observation are rejected, other
-landmarks were rejected before, and a single motion of the robot explains all of them.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 import math
 
 import numpy as np
@@ -22,23 +14,15 @@ from slam_observer_ros.association.joint_compatibility import huber_loss, joint_
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import (
     mahalanobis,
-    solve_symmetric,
-    transpose,
     with_blocks,
 )
-from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.observer.observer import Residuals
-from slam_observer_ros.observer.robust import accepted, gated
-from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.observer.robust import gated
 from slam_observer_ros.state.matching import (
-    match,
     MatchedObservation,
     rejected_before,
-    residuals_of,
 )
 from slam_observer_ros.state.state import State
 
@@ -145,163 +129,3 @@ class NewLandmarks:
         self._stamp_ns = event.stamp_ns
         self._points += len(event.ids)
         self._new += confirmed
-
-
-MAX_DURATION_S = 4.0
-"""Time, seconds, for which odometry is taken to have been wrong, at most."""
-
-LARGE_TURN_RAD = 0.3
-"""Turn, radians, that a correction, which is linear in it, does not find well."""
-
-ITERATIONS = 10
-"""Gauss-Newton steps to the likeliest pose; the last ones hardly move it."""
-
-MIN_VARIANCE = 1e-6
-"""Least variance of a motion without odometry, rad² or m²."""
-
-
-def slip(state: State, matched: MatchedObservation) -> float:
-    """Let the robot have slipped to where it sees these landmarks; return the cost of the motion.
-
-    Its pose is then as uncertain as if there had been no odometry for as long as that takes. The
-    observation is yet to be used.
-    """
-    # The noise of a motion without odometry, for as long as it takes.
-    observer, start = state.observer, state.observer.A.copy()
-    needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
-    stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
-    noise = state.motion_noise.covariances(stray)
-    variances = np.maximum(np.diagonal(noise[1])[state.axes.pose], MIN_VARIANCE)
-    # That motion, to where the landmarks put the robot.
-    after = _pose_after(state, matched, variances)
-    motion = Motion(
-        path=np.array([start, after, after]),
-        measured_velocities=stray.body_velocities,
-        dt_s=stray.dt_s,
-        covariances=noise,
-        duration_s=0.0,
-        at_ends=None,
-        calibration=state.calibration,
-        is_slip=True,
-    )
-    state.propagate(motion)
-    state.counts['slip'] += 1
-    strayed = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
-    return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
-
-
-def _duration_s(state: State, matched: MatchedObservation) -> float:
-    """Return how long a robot without odometry would take to get there, seconds."""
-    settings, k, residuals = state.settings, state.axes.point, matched.residuals
-    points = matched.known.points
-    turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
-    after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
-    needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE)
-    return float(np.mean(needed_s))
-
-
-def _pose_after(state: State, matched: MatchedObservation, variances: FloatArray) -> FloatArray:
-    """Return the likeliest Â (4, 4) after a motion of ``variances`` (p,), if it is far off."""
-    # If it is not far, the correction that follows, which is linear, finds it as well.
-    A, found = state.observer.A, _likeliest_pose(state, matched, variances)
-    turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
-    shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
-    reach_m = state.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)
-    return found if turn_rad > LARGE_TURN_RAD or shift_m > reach_m else A
-
-
-def _likeliest_pose(
-    state: State, matched: MatchedObservation, variances: FloatArray
-) -> FloatArray:
-    """Return Â (4, 4) by Gauss-Newton steps, as if landmarks and start were known exactly."""
-    A, axes = state.observer.A, state.axes
-    landmarks = state.observer.points[matched.residuals.rows]
-    points = matched.known.points
-    # First aligned by the landmarks alone, if they suffice.
-    W = np.linalg.inv(matched.covariances[matched.rows >= 0][:, : axes.point, : axes.point])
-    found = A
-    if len(points) >= axes.point:
-        weights = np.trace(W, axis1=1, axis2=2)
-        found = rigid_alignment(se3.transform(A, points), landmarks, weights) @ A
-    # Then by landmarks and motion together.
-    for _ in range(ITERATIONS):
-        expected = se3.transform(se3.inverse(found), landmarks)
-        C = axes.output_matrix(expected)
-        CW, left = transpose(C) @ W, (points - expected)[:, : axes.point, None]
-        strayed = se3.log(se3.inverse(A) @ found)[axes.pose]
-        H = np.diag(1.0 / variances) + np.sum(CW @ C, axis=0)
-        gradient = strayed / variances + np.sum(CW @ left, axis=0)[:, 0]
-        found = found @ se3.exp(-axes.full_pose(solve_symmetric(H, gradient)))
-    return found
-
-
-AGREEMENT = 3.0
-"""Standard deviations within which earlier landmarks must be where a corrected pose has them."""
-
-
-class RejectedLandmarks:
-    """Landmarks that were rejected since one last passed the gate: a slip may explain them all."""
-
-    def __init__(self) -> None:
-        # By id, where each seemed to be: (3,) metres, reference frame; (3, 3) m², body frame.
-        self._rejected: dict[int, tuple[FloatArray, FloatArray]] = {}
-
-    def clear(self) -> None:
-        """Forget what was rejected."""
-        self._rejected.clear()
-
-    def explain_by_slip(self, state: State, matched: MatchedObservation) -> bool:
-        """Let the robot have slipped if that explains all rejections; return whether it does.
-
-        Then the observation has to be matched again.
-        """
-        known, settings = matched.known, state.settings
-        if not len(known.ids):
-            return False
-        gate = settings.rejection_threshold
-        if accepted(state.gains.distances(matched.residuals), gate).any():
-            self.clear()
-            return False
-        may_stray = settings.unknown_linear_motion or settings.unknown_angular_motion
-        others = [i for i in self._rejected if i not in known.ids]
-        if others and may_stray and self._agree(state, matched, others):
-            slip(state, matched)
-            self.clear()
-            return True
-        self._note(state, matched)
-        return False
-
-    def _agree(self, state: State, matched: MatchedObservation, others: list[int]) -> bool:
-        """Return whether a pose that explains this observation explains the ``others``, too."""
-        trial = state.copy()
-        slip(trial, matched)
-        trial.gains.observe(match(trial, matched.event).residuals)
-        ids = np.array(others)
-        rows = trial.landmarks.rows_of(ids)
-        rejected = zip(*(self._rejected[i] for i in others), strict=True)
-        positions, covariances = (np.array(each) for each in rejected)
-        # The earlier points as they would be seen now, with the same error of the pose.
-        back = se3.inverse(state.observer.A)
-        seen = replace(
-            matched.known,
-            ids=ids,
-            points=se3.transform(back, positions),
-            covariances=covariances,
-            velocities=None,
-            sensor=None,
-            sensed=None,
-        )
-        if (rows < 0).any():  # one was forgotten meanwhile
-            return False
-        trial.gains.prepare(rows)
-        residuals = residuals_of(trial, seen, rows, covariances)
-        return bool((trial.gains.distances(residuals) <= AGREEMENT).all())
-
-    def _note(self, state: State, matched: MatchedObservation) -> None:
-        """Note where landmarks seem to be that are rejected."""
-        positions = se3.transform(state.observer.A, matched.known.points)
-        covariances = matched.covariances[matched.rows >= 0]
-        for landmark_id, position, covariance in zip(
-            matched.known.ids.tolist(), positions, covariances, strict=True
-        ):
-            self._rejected[landmark_id] = position, covariance

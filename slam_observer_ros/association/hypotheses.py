@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.association.costs import NewLandmarks, RejectedLandmarks
+from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     as_its_ids_say,
@@ -32,6 +32,7 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
+from slam_observer_ros.association.slip import RejectedLandmarks
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, Update

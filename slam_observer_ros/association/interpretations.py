@@ -22,11 +22,11 @@ from slam_observer_ros.association.costs import (
     outlier_cost,
     pairing_cost,
     rejection_cost,
-    slip,
     SLIP_COST,
 )
 from slam_observer_ros.association.hypothesis import LandmarkIndex, Verdicts
 from slam_observer_ros.association.joint_compatibility import joint_cost
+from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID

@@ -46,10 +46,11 @@ class Estimate:
         made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
         (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
         had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
-        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'carried_landmark'``,
-        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``,
-        ``'merged_landmark'``, ``'doubled_landmark'``) and points not used (``'unknown_id'``,
-        ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
+        landmarks (``'rejected_landmark'``, ``'rejected_orientation'``, ``'moved_landmark'``,
+        ``'carried_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
+        ``'unsupported_landmark'``, ``'merged_landmark'``, ``'doubled_landmark'``) and points not
+        used (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
+        ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 

@@ -222,7 +222,8 @@ class Postponed(Protocol):
 class FilterArrays(LandmarkColumns):
     """X̂ and ξ° in the frame of P°, and the covariance of their errors where it is known.
 
-    Only this folder writes to them; others read, and copy what they keep. Attributes are
+    Gains write to them, and what takes over a step, a relinearised past or a map; others read, and
+    copy what they keep. Attributes are
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
     each (n, 3), metres and m/s, the ``orientations`` of tags, what was seen of each landmark
     (``landmarks``), and ``covariance``, P (N, N), empty for gains that know none.

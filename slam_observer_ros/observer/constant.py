@@ -33,9 +33,9 @@ class ConstantGains(Gains):
     """Constant gains k (30) and l (31), the same for every landmark.
 
     The ``step_mode`` 'paper' turns about the reference's origin with the metric of (10), and so
-    converges to the paper's equation (:mod:`.innovation`) for dt → 0; 'exponential' turns about
-    the centroid of the e_i, where rotation and translation do not compete. In ``two_d_mode`` all
-    turns are about z.
+    converges to the paper's equation (:mod:`.continuous_time`) for dt → 0; 'exponential' turns
+    about the centroid of the e_i, where rotation and translation do not compete. In
+    ``two_d_mode`` all turns are about z.
     """
 
     ignores = (

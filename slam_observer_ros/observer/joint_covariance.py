@@ -153,9 +153,9 @@ class JointCovariance:
 
     # The step
 
-    def put_back(self, column: NDArray[Any], active: NDArray[Any]) -> None:
-        """Write what was read of all landmarks' ``column`` at those in P, and changed, there."""
-        # Here this is a view.
+    def write_active(self, column: NDArray[Any], active: NDArray[Any]) -> None:
+        """Write what was read of a ``column`` at the landmarks in P, and changed, back to it."""
+        # All are in P: what was read is a view of the column.
 
     def note_motion(self) -> None:
         """Note that the robot has moved."""

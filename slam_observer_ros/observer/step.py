@@ -47,11 +47,13 @@ from slam_observer_ros.observer.robust import (
 from slam_observer_ros.sensor_models.calibration import calibrated, with_moves
 from slam_observer_ros.sensor_models.motion_noise import (
     Factors,
-    learnt,
     motion_variances,
     MotionFigures,
     score,
     stated_motion_covariances,
+)
+from slam_observer_ros.sensor_models.motion_noise import (
+    learnt as learnt_factors,
 )
 from slam_observer_ros.sensor_models.observation_noise import (
     point_covariances,
@@ -432,7 +434,7 @@ def _learnt(
         used = np.flatnonzero(np.repeat(passed, k))  # some few are left out
         S, C, r = S[np.ix_(used, used)], C[used], r[used]
     u, G = C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:])
-    return learnt(factors.logs, factors.information, *score(u, G, N, squared, len(solved)))
+    return learnt_factors(factors.logs, factors.information, *score(u, G, N, squared, len(solved)))
 
 
 def _take_over(factors: Factors | None, learnt: tuple[FloatArray, FloatArray] | None) -> None:

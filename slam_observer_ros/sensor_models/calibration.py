@@ -70,7 +70,7 @@ OF_VELOCITY = (
     *_entries('linear_bias', _BIASES[3:]),
     *_entries(DELAY_NAME, [DELAY]),
 )
-"""All that may be calibrated of velocities: one more entry of M is one more row."""
+"""All that may be calibrated of velocities, the delay last: one more entry of M is a row more."""
 
 OF_SENSOR = (
     *_entries('sensor_rotation', range(3)),

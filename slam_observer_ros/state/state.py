@@ -46,7 +46,7 @@ class State:
         self.was_contradicted = False  # most known landmarks seen last were rejected
         self.observation_noise = ObservationNoise(settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
-        self._end_velocity: FloatArray | None = None
+        self.end_velocity: FloatArray | None = None
 
     def copy(self) -> State:
         """Return an independent copy: one copy of memory an array."""
@@ -131,7 +131,7 @@ class State:
             self.observer.A,
             start_ns,
             stamps_ns,
-            self._end_velocity,
+            self.end_velocity,
             with_covariances,
         )
 
@@ -144,7 +144,7 @@ class State:
             self.observer.A,
             start_ns,
             end_ns,
-            self._end_velocity,
+            self.end_velocity,
         )
 
     def propagate(self, motion: Motion) -> None:
@@ -152,7 +152,7 @@ class State:
         self.gains.advance(motion)
         self.relinearisation.move(motion)
         if motion.at_ends is not None:
-            self._end_velocity = motion.at_ends[1]
+            self.end_velocity = motion.at_ends[1]
 
     def update(
         self,
@@ -194,7 +194,7 @@ class State:
 
     def clear_time(self) -> None:
         """Go on from here at any other time; what was seen before is not relinearised."""
-        self._end_velocity = None
+        self.end_velocity = None
         self.was_contradicted = False
         self.landmarks.clear_time()
         self.forget_past('the clock jumped')

@@ -64,7 +64,7 @@ def advance(
     state.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
     x.A[...] = out.A
     if state.calibration.delay_error_ns:
-        state._end_velocity = out.at_end
+        state.end_velocity = out.at_end
     return out.variances
 
 
@@ -131,7 +131,10 @@ class Corrected(NamedTuple):
 
 
 def finish(state: State, event: ObservationEvent, corrected: Corrected) -> Update:
-    """Keep a keyframe of an observation that has corrected a state by all its points."""
+    """Keep a keyframe of an observation that has corrected a state by all its points.
+
+    The past may be relinearised by that.
+    """
     past, out = state.relinearisation, corrected.out
     if past.is_active:
         past.add(keyframe(state, event, corrected), in_doubt=False)
@@ -229,7 +232,7 @@ def _take_over(
     x.A[...] = out.A
     columns = (state.observer.a, *_columns(state))
     for column, changed in zip(columns, (x.a, *landmarks), strict=True):
-        joint.put_back(column, changed)
+        joint.write_active(column, changed)
     joint.follow(out.moved)
     calibration, p = state.calibration, state.axes.p
     if calibration.count:
@@ -289,7 +292,7 @@ def _interval(state: State, start_ns: int, end_ns: int) -> Interval:
         end_ns,
         calibration.delay_ns,
         calibration.delay_error_ns,
-        state._end_velocity,
+        state.end_velocity,
     )
 
 

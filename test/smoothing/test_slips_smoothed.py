@@ -9,7 +9,7 @@ from gain_worlds import START_NS
 import numpy as np
 import pytest
 
-from slam_observer_ros.association.costs import slip
+from slam_observer_ros.association.slip import slip
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3

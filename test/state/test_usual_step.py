@@ -66,7 +66,7 @@ def parts(state):
         'noise': noise,
         'sensitivity': sensitivity,
         'drift': drift,
-        'end velocity': np.zeros(0) if state._end_velocity is None else state._end_velocity,
+        'end velocity': np.zeros(0) if state.end_velocity is None else state.end_velocity,
         'table': np.concatenate(
             [table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns]
         ),

@@ -93,8 +93,8 @@ class ActiveLandmarks(JointCovariance):
         self._postponed.move(turn, x[self._entries])
         self._following.work()
 
-    def put_back(self, column: NDArray[Any], active: NDArray[Any]) -> None:
-        """Write what was read of all landmarks' ``column`` at those in P, and changed, there."""
+    def write_active(self, column: NDArray[Any], active: NDArray[Any]) -> None:
+        """Write what was read of a ``column`` at the landmarks in P, and changed, back to it."""
         column[self.active] = active
 
     def note_motion(self) -> None:
