@@ -38,7 +38,7 @@ class BaselineNoise:
             return event
         if event.sensor_frame not in self._calibration.sensors:
             self._calibration.add_sensor(event.sensor_frame)
-        return sensing.corrected(self._calibration, self._settings, event)
+        return sensing.calibrated(self._calibration, self._settings, event)
 
     def add(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
         """Take in an observation; call it once for each, in the order of the stamps.
