@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from slam_observer_ros import common
+
 if TYPE_CHECKING:
     from slam_observer_ros.common.process import use_one_thread
     from slam_observer_ros.estimator.estimator import Estimator
@@ -12,7 +14,7 @@ if TYPE_CHECKING:
     from slam_observer_ros.known_map.landmark_map import LandmarkMap
     from slam_observer_ros.settings.estimator_settings import Settings
 
-__version__ = '0.1.0'
+__version__ = common.__version__
 
 __all__ = [
     'AngularVelocityEvent',

@@ -10,7 +10,6 @@ import logging
 import os
 from pathlib import Path
 
-from slam_observer_ros import __version__
 from slam_observer_ros.cli.batch_index import INDEX, SCORES, write_index
 from slam_observer_ros.cli.batch_jobs import (
     find_recordings,
@@ -41,6 +40,7 @@ from slam_observer_ros.cli.replay_files import write_report_of
 from slam_observer_ros.cli.replay_outcome import with_logged
 from slam_observer_ros.cli.replay_request import add_run_options, read_request, Records
 from slam_observer_ros.cli.replay_run import replayed
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import IncompleteError, OutputError, UsageError
 from slam_observer_ros.common.files import destination
 from slam_observer_ros.evaluation.trajectory import write_tum

@@ -24,9 +24,9 @@ import re
 import sys
 from typing import Any
 
-from slam_observer_ros import __version__
 from slam_observer_ros.cli.options import parse_value
 from slam_observer_ros.cli.replay_request import ReplayRequest
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError, shown, UsageError
 from slam_observer_ros.common.files import not_special, unfinished_file

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 
-from slam_observer_ros import __version__
 from slam_observer_ros.cli.calibration_finder import Finder, growth
 from slam_observer_ros.cli.calibration_stated import (
     depth_text,
@@ -45,6 +44,7 @@ from slam_observer_ros.cli.outputs import (
     check_outputs,
 )
 from slam_observer_ros.cli.replay_request import read_request, ReplayRequest, select_inputs
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.known_map.map_file import read_map

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import print_json, print_table
 from slam_observer_ros.cli.options import named_path
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent

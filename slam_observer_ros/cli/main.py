@@ -17,7 +17,6 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
-    from slam_observer_ros import __version__
     from slam_observer_ros.cli.console import (
         complete,
         MessageHandler,
@@ -25,6 +24,7 @@ with leaving_at_once():
         show_message,
         typed_words,
     )
+    from slam_observer_ros.common import __version__
     from slam_observer_ros.common.errors import (
         IncompleteError,
         LossError,

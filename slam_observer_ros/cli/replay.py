@@ -7,7 +7,6 @@ from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import kept_warnings, print_json, print_table
 from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
 from slam_observer_ros.cli.outputs import add_force_option
@@ -20,6 +19,7 @@ from slam_observer_ros.cli.replay_files import (
 from slam_observer_ros.cli.replay_outcome import ReplayOutcome, with_logged
 from slam_observer_ros.cli.replay_request import add_run_options, read_request, warn_of_unused
 from slam_observer_ros.cli.replay_run import replayed
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import LossError, OutputError
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from slam_observer_ros import __version__
 from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
 from slam_observer_ros.cli.held_out import (
     add_material_options,
@@ -37,6 +36,7 @@ from slam_observer_ros.cli.outputs import (
     check_outputs,
 )
 from slam_observer_ros.cli.replay_request import read_request
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from slam_observer_ros import __version__
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import MapError, shown, YamlError
 from slam_observer_ros.common.files import (
     constructed,

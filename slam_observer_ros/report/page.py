@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from slam_observer_ros import __version__
+from slam_observer_ros.common import __version__
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
