@@ -29,7 +29,7 @@ LEAST_SEEN = 4
 ITERATIONS = 10
 """Gauss–Newton steps of a fit, from the unweighted one."""
 
-SCORED = ('scheduled', 'riccati', 'textbook EKF')
+SCORED = ('riccati', 'textbook EKF')
 
 
 def main() -> None:

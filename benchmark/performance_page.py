@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import worlds
 
-from slam_observer_ros.evaluation.drawing import BLACK, BLUE, GREEN, PURPLE, RED, save, STYLE
+from slam_observer_ros.evaluation.drawing import BLACK, GREEN, PURPLE, RED, save, STYLE
 
 FIGURES = worlds.CHECKOUT / 'benchmark' / 'performance.json'
 PAGE = worlds.CHECKOUT / 'docs' / 'performance.md'
@@ -40,7 +40,6 @@ BARS = (
 
 DRAWN = {
     'constant': {'color': BLACK, 'marker': 's'},
-    'scheduled': {'color': BLUE, 'marker': 'D'},
     'riccati': {'color': GREEN, 'marker': '^'},
     EKF: {'color': RED, 'marker': 'o'},
     ISAM2_DEFAULT: {'color': PURPLE, 'marker': 'v'},

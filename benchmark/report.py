@@ -55,7 +55,6 @@ AIMS = (
     ('configuration_rmse_m', 'riccati', ISAM2, 'mean ≤ 1, each ≤ 1.15'),
     ('configuration_rmse_m', 'riccati', ISAM2_DEFAULT, ''),
     ('configuration_rmse_m', UNCALIBRATED, ISAM2, ''),
-    ('configuration_rmse_m', 'scheduled', 'riccati', '≤ 1.2'),
     ('configuration_rmse_m', EKF, 'riccati', '≥ 0.98'),
     ('ate_rmse_m', 'riccati', ISAM2, '≤ 1'),
     ('ate_rmse_m', SMOOTHED, BATCH, '≤ 1.02'),
@@ -106,10 +105,9 @@ recordings. The simulated worlds have the noise that these files state, but with
 from one observation to the next. Where errors last (`observation_correlation_time`, for wheeled
 robots) all estimators are given the same larger covariances.
 
-- **constant, scheduled, riccati**: this project's gain designs. In the wheeled configuration
-  `scheduled` and `riccati` also estimate scale, bias and delay of the odometry, which GTSAM and
-  the EKF don't do here; `riccati, no calibration` has that switched off, for a comparison on equal
-  terms.
+- **constant, riccati**: this project's gain designs. In the wheeled configuration `riccati` also
+  estimates scale, bias and delay of the odometry, which GTSAM and the EKF don't do here;
+  `riccati, no calibration` has that switched off, for a comparison on equal terms.
 - **textbook EKF**: world-frame errors and absolute landmarks (`benchmark/ekf_slam.py`), with the
   observer's gate and Huber weights.
 - **iSAM2**: GTSAM, updated and read out in full after each observation; relinearizeSkip 1,

@@ -37,7 +37,7 @@ LONGEST_S = 3.0  # of CPU for one cell, beyond which no further step is begun
 
 ISAM2_QR = 'iSAM2, its defaults with QR'
 
-ESTIMATORS = ('constant', 'scheduled', 'riccati', EKF, ISAM2_DEFAULT, ISAM2)
+ESTIMATORS = ('constant', 'riccati', EKF, ISAM2_DEFAULT, ISAM2)
 
 
 def measure_steps() -> Tables:

@@ -76,7 +76,6 @@ LONGEST = (
     'test_plots',
     'test_smoothing',
     'test_given_poses',
-    'test_scheduled',
 )
 """Files that take longest, of those without nodes: they begin early, so that none ends alone."""
 

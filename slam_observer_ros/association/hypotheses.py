@@ -32,7 +32,6 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.association.slip import RejectedLandmarks
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, Update
@@ -80,7 +79,6 @@ class Hypotheses:
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
-        self._rejected = RejectedLandmarks()
         self._new_landmarks = NewLandmarks()
         self._standing = Standing()
         self._velocities: VelocityHistory | None = None  # along which they were moved
@@ -201,7 +199,6 @@ class Hypotheses:
         """Let all hypotheses go on from where they are at any other time."""
         for hypothesis in self._all:
             hypothesis.state.clear_time()
-        self._rejected.clear()
         self._standing.clear_time()
 
     def forget(self, landmark_id: int) -> bool:
@@ -255,7 +252,7 @@ class Hypotheses:
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         if not self._can_weigh:
-            return self._observe_alone(event)
+            return step(self.best, match(self.best, event))
         matched = match(self.best, event) if len(self._all) == 1 else None
         if matched is not None and not unknown:
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matched)
@@ -270,13 +267,6 @@ class Hypotheses:
         if unknown:
             self._new_landmarks.note(event, self._all[0].visibility.confirmed_now)
         return children[0].update
-
-    def _observe_alone(self, event: ObservationEvent) -> Update:
-        """Use an observation that can't be weighed: of a state without a joint covariance."""
-        matched = match(self.best, event)
-        if self._rejected.explain_by_slip(self.best, matched):
-            matched = match(self.best, event)
-        return step(self.best, matched)
 
     def _follow(
         self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]

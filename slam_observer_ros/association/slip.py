@@ -1,15 +1,11 @@
 """A robot that is not where odometry has it: its wheels slipped, or someone carried it.
 
-Filters with a joint covariance weigh that as a hypothesis. For all other filters
-:class:`RejectedLandmarks` decides whether the pose is wrong, as observation after observation
-contradicts it: a rejected landmark may have moved, and a rejected observation may be garbled. The
-pose is wrong if three things come together: all landmarks of an observation are rejected, other
-landmarks were rejected before, and a single motion of the robot explains all of them.
+A slip is weighed as one hypothesis among others (:mod:`.interpretations`), which takes a joint
+covariance of pose and landmarks.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 import math
 
 import numpy as np
@@ -22,14 +18,9 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
 )
 from slam_observer_ros.geometry.se3 import rigid_alignment
-from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion
-from slam_observer_ros.state.matching import (
-    match,
-    MatchedObservation,
-    residuals_of,
-)
+from slam_observer_ros.state.matching import MatchedObservation
 from slam_observer_ros.state.state import State
 
 MAX_DURATION_S = 4.0
@@ -118,75 +109,3 @@ def _likeliest_pose(
         gradient = strayed / variances + np.sum(CW @ left, axis=0)[:, 0]
         found = found @ se3.exp(-axes.full_pose(solve_symmetric(H, gradient)))
     return found
-
-
-AGREEMENT = 3.0
-"""Standard deviations within which earlier landmarks must be where a corrected pose has them."""
-
-
-class RejectedLandmarks:
-    """Landmarks that were rejected since one last passed the gate: a slip may explain them all."""
-
-    def __init__(self) -> None:
-        # By id, where each seemed to be: (3,) metres, reference frame; (3, 3) m², body frame.
-        self._rejected: dict[int, tuple[FloatArray, FloatArray]] = {}
-
-    def clear(self) -> None:
-        """Forget what was rejected."""
-        self._rejected.clear()
-
-    def explain_by_slip(self, state: State, matched: MatchedObservation) -> bool:
-        """Let the robot have slipped if that explains all rejections; return whether it does.
-
-        Then the observation has to be matched again.
-        """
-        known, settings = matched.known, state.settings
-        if not len(known.ids):
-            return False
-        gate = settings.rejection_threshold
-        if accepted(state.gains.distances(matched.residuals), gate).any():
-            self.clear()
-            return False
-        may_stray = settings.unknown_linear_motion or settings.unknown_angular_motion
-        others = [i for i in self._rejected if i not in known.ids]
-        if others and may_stray and self._agree(state, matched, others):
-            slip(state, matched)
-            self.clear()
-            return True
-        self._note(state, matched)
-        return False
-
-    def _agree(self, state: State, matched: MatchedObservation, others: list[int]) -> bool:
-        """Return whether a pose that explains this observation explains the ``others``, too."""
-        trial = state.copy()
-        slip(trial, matched)
-        trial.gains.observe(match(trial, matched.event).residuals)
-        ids = np.array(others)
-        rows = trial.landmarks.rows_of(ids)
-        rejected = zip(*(self._rejected[i] for i in others), strict=True)
-        positions, covariances = (np.array(each) for each in rejected)
-        # The earlier points as they would be seen now, with the same error of the pose.
-        back = se3.inverse(state.observer.A)
-        seen = replace(
-            matched.known,
-            ids=ids,
-            points=se3.transform(back, positions),
-            covariances=covariances,
-            velocities=None,
-            sensor=None,
-            sensed=None,
-        )
-        if (rows < 0).any():  # one was forgotten meanwhile
-            return False
-        trial.gains.prepare(rows)
-        residuals = residuals_of(trial, seen, rows, covariances)
-        return bool((trial.gains.distances(residuals) <= AGREEMENT).all())
-
-    def _note(self, state: State, matched: MatchedObservation) -> None:
-        """Note where landmarks seem to be that are rejected."""
-        positions = se3.transform(state.observer.A, matched.known.points)
-        covariances = matched.covariances[matched.rows >= 0]
-        for landmark_id, position, covariance in zip(
-            matched.known.ids.tolist(), positions, covariances, strict=True
-        ):
-            self._rejected[landmark_id] = position, covariance

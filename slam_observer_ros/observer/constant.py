@@ -21,9 +21,9 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
 from slam_observer_ros.observer.continuous_time import lyapunov
-from slam_observer_ros.observer.gains import Gains, OF_JOINT_COVARIANCES
+from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.observer import Residuals
-from slam_observer_ros.sensor_models.calibration import VELOCITY_STDDEVS
+from slam_observer_ros.sensor_models.calibration import SENSOR_STDDEVS, VELOCITY_STDDEVS
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
@@ -40,7 +40,8 @@ class ConstantGains(Gains):
 
     ignores = (
         *VELOCITY_STDDEVS,
-        *OF_JOINT_COVARIANCES,
+        *SENSOR_STDDEVS,
+        'motion_noise_factor',
         'calibration_drift',
         'landmark_velocity_stddev',
         'observation_correlation_time',

@@ -1,7 +1,7 @@
 """The paper's innovation (28)–(31) in continuous time, and the Lyapunov function that it lowers.
 
 Tests hold gains against it; what moves a robot are the gains themselves, of constant.py (the same
-in steps of any length), scheduled.py and riccati/ (by a covariance).
+in steps of any length) and riccati/ (by a covariance).
 
 Signs are put right: as printed, (30) has no minus and (31) has one too many, and L grows. They
 follow from ė_i = Δ e_i + Δ â_i − δ_i, for which (35) holds. Gains k_i, l_i are (m,), errors e_i,

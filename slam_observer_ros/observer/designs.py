@@ -6,12 +6,10 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.observer.constant import ConstantGains
 from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
-from slam_observer_ros.observer.scheduled import ScheduledGains
 from slam_observer_ros.settings.estimator_settings import Settings
 
 DESIGNS: dict[str, type[Gains]] = {
     'constant': ConstantGains,
-    'scheduled': ScheduledGains,
     'riccati': RiccatiGains,
 }
 """The values of the parameter ``gains``, and what they are."""

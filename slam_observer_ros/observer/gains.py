@@ -24,7 +24,6 @@ from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer, Residuals
 from slam_observer_ros.sensor_models.calibration import (
     Calibration,
-    SENSOR_STDDEVS,
     without_calibration,
 )
 from slam_observer_ros.sensor_models.motion import Motion, Passage
@@ -36,13 +35,6 @@ if TYPE_CHECKING:
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 """Settings without effect on other gains; ``gain_k`` is in the Lyapunov value of all."""
-
-
-OF_JOINT_COVARIANCES = (
-    'motion_noise_factor',
-    *SENSOR_STDDEVS,
-)
-"""Settings of what only a joint covariance can estimate."""
 
 
 class Errors:
@@ -158,9 +150,6 @@ class Gains(ABC):
 
     def activate(self, rows: IntArray) -> None:  # noqa: B027 (most gains treat all alike)
         """See to it that landmarks (m,) are at hand that are going to be observed."""
-
-    def prepare(self, rows: IntArray) -> None:  # noqa: B027 (most gains postpone nothing)
-        """Bring landmarks (m,) up to date that are going to be observed; −1 for a new one."""
 
     def residuals(
         self,

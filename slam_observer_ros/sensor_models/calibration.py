@@ -369,16 +369,7 @@ def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
 
 def without_calibration(settings: Settings) -> Settings:
     """Return settings that estimate nothing of the calibration, as stated as it may be."""
-    return _certain(without_sensor_calibration(settings), VELOCITY_STDDEVS)
-
-
-def without_sensor_calibration(settings: Settings) -> Settings:
-    """Return settings that take sensors to be mounted, and to err, just as stated."""
-    return _certain(settings, SENSOR_STDDEVS)
-
-
-def _certain(settings: Settings, stddevs: tuple[str, ...]) -> Settings:
-    """Return settings in which some standard deviations are zero."""
     zero: dict[bool, Any] = {True: (0.0, 0.0, 0.0), False: 0.0}
+    stddevs = (*SENSOR_STDDEVS, *VELOCITY_STDDEVS)
     are_vectors = {name: isinstance(getattr(settings, name), tuple) for name in stddevs}
     return replace(settings, **{name: zero[is_vector] for name, is_vector in are_vectors.items()})

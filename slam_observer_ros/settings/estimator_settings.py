@@ -22,9 +22,8 @@ class Settings:
 
     gains: str = parameter(
         'riccati',
-        'What sets the gains: two numbers (constant), the full covariance (riccati), or a part '
-        'of it, for thousands of landmarks (scheduled)',
-        choices=('constant', 'scheduled', 'riccati'),
+        'What sets the gains: two numbers (constant) or the covariance of all errors (riccati)',
+        choices=('constant', 'riccati'),
         basic=True,
     )
     two_d_mode: bool = parameter(
@@ -255,7 +254,7 @@ class Settings:
     )
     observation_correlation_time: float = parameter(
         0.0,
-        'Scheduled and Riccati gains: correlation time of the error of an observed landmark, such '
+        'Riccati gains: correlation time of the error of an observed landmark, such '
         'as that of a calibration, or of a tag seen from one side; 0 for errors that are '
         'independent in each observation',
         unit='s',
@@ -300,21 +299,21 @@ class Settings:
     )
     angular_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Scheduled and Riccati gains: scale error of the angular velocity x y z to be estimated: '
+        'Riccati gains: scale error of the angular velocity x y z to be estimated: '
         'its standard deviation',
         minimum=0.0,
         maximum=1.0,
     )
     linear_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Scheduled and Riccati gains: scale error of the linear velocity x y z to be estimated: '
+        'Riccati gains: scale error of the linear velocity x y z to be estimated: '
         'its standard deviation',
         minimum=0.0,
         maximum=1.0,
     )
     angular_bias_stddev: Vector3 = parameter(
         (0.005, 0.005, 0.005),
-        'Scheduled and Riccati gains: bias of the angular velocity x y z to be estimated: its '
+        'Riccati gains: bias of the angular velocity x y z to be estimated: its '
         "standard deviation; the default is that of a MEMS gyroscope's zero, or of wheels that "
         'differ by a few thousandths; 0 for none',
         unit='rad/s',
@@ -323,15 +322,14 @@ class Settings:
     )
     linear_bias_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Scheduled and Riccati gains: bias of the linear velocity x y z to be estimated: its '
-        'standard deviation',
+        'Riccati gains: bias of the linear velocity x y z to be estimated: its standard deviation',
         unit='m/s',
         minimum=0.0,
         maximum=100.0,
     )
     velocity_delay_stddev: float = parameter(
         0.2,
-        'Scheduled and Riccati gains: delay from the stamp of a velocity to its effect in '
+        'Riccati gains: delay from the stamp of a velocity to its effect in '
         'observations, to be estimated: its standard deviation; 0 for none',
         unit='s',
         minimum=0.0,
@@ -376,7 +374,7 @@ class Settings:
     )
     calibration_drift: float = parameter(
         0.0,
-        'Scheduled and Riccati gains: how fast the calibration of velocity and sensors drifts, as '
+        'Riccati gains: how fast the calibration of velocity and sensors drifts, as '
         'a share of the standard deviation of each part',
         unit='1/√s',
         minimum=0.0,
@@ -391,7 +389,7 @@ class Settings:
     )
     huber_threshold: float = parameter(
         1.345,
-        'Scheduled and Riccati gains: standard deviations of noise beyond which an observation '
+        'Riccati gains: standard deviations of noise beyond which an observation '
         'loses weight; 0 for never',
         minimum=0.0,
         maximum=1e9,
@@ -399,7 +397,7 @@ class Settings:
     )
     rejection_threshold: float = parameter(
         6.0,
-        'Scheduled and Riccati gains: standard deviations of the residual beyond which an '
+        'Riccati gains: standard deviations of the residual beyond which an '
         'observation is rejected',
         unit='σ',
         minimum=1.0,
@@ -414,7 +412,7 @@ class Settings:
     )
     max_rejections: int = parameter(
         5,
-        'Scheduled and Riccati gains: rejections in a row, all at one position, after which a '
+        'Riccati gains: rejections in a row, all at one position, after which a '
         'landmark is taken to have moved; one more than it was seen, if that is fewer',
         minimum=1,
         maximum=1_000_000,

@@ -109,7 +109,6 @@ def residuals_of(
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
     D = None
     if event.sensed is not None:
-        state.gains.prepare(rows)
         D = sensitivity(state, event, state.observer.body_points(rows))
     return state.gains.residuals(rows, event.points, covariances, dt_s, D)
 
@@ -154,7 +153,6 @@ def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> 
     the robot. The bearing is the measured one: the sensor knows it better than a state whose
     heading is yet to be corrected.
     """
-    state.gains.prepare(rows)
     measured, expected = event.lines_of_sight, _lines_of_sight(state, event, rows)
     expected_squared = np.einsum('ij,ij->i', expected, expected)
     measured_squared = np.einsum('ij,ij->i', measured, measured)

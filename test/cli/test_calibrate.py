@@ -127,7 +127,7 @@ def test_where_all_is_as_stated_nothing_is_written(slam_observer, tmp_path):
 def test_what_can_not_be_calibrated_is_refused(slam_observer, tmp_path):
     world = drive(Settings(**MODEL), 5.0)
     recording, survey = recorded(tmp_path / 'run.mcap', world)
-    refused = slam_observer.fail('calibrate', recording, '--gains', 'scheduled')
+    refused = slam_observer.fail('calibrate', recording, '--gains', 'constant')
     assert 'needs riccati gains' in refused
     assert 'none.yaml' in slam_observer.fail('calibrate', recording, '--map', 'none.yaml')
     kept = slam_observer.fail('calibrate', recording, '--map', survey, '-o', survey, '--force')

@@ -299,6 +299,6 @@ def test_configurations_are_found_wherever_pip_has_put_them(tmp_path, monkeypatc
     (about / 'METADATA').write_text('Name: slam_observer_ros\nVersion: 1.0\n')
     (about / 'RECORD').write_text('../../share/slam_observer_ros/config/blimp.yaml,,\n')
     (share / 'config').mkdir(parents=True)
-    (share / 'config' / 'blimp.yaml').write_text('/**: {ros__parameters: {gains: scheduled}}\n')
+    (share / 'config' / 'blimp.yaml').write_text('/**: {ros__parameters: {gains: constant}}\n')
     monkeypatch.syspath_prepend(str(site))
     assert find_config('blimp').samefile(share / 'config' / 'blimp.yaml')

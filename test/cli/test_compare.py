@@ -27,8 +27,8 @@ def test_gains_files_and_trajectories_are_compared(slam_observer, tmp_path):
     assert compared['constant']['anees'] is None
     assert all(name in picture.read_text() for name in ('riccati', 'mine.yaml'))
     assert 'exists already' in slam_observer.fail('compare', recording, *what, '--plot', picture)
-    table = slam_observer.succeed('compare', recording, 'riccati', 'scheduled').output
-    assert 'scheduled' in table
+    table = slam_observer.succeed('compare', recording, 'riccati', 'constant').output
+    assert 'constant' in table
 
 
 @pytest.fixture(name='beginning', scope='module')
@@ -42,7 +42,7 @@ def fixture_trajectories(tmp_path_factory):
     """A trajectory of the sample, and its first tenth."""
     folder = tmp_path_factory.mktemp('trajectories')
     whole, short = folder / 'whole.tum', folder / 'first_tenth_of_the_trajectory.tum'
-    assert main(['replay', str(SAMPLE), '--gains', 'scheduled', '--tum', str(whole)]) == 0
+    assert main(['replay', str(SAMPLE), '--gains', 'constant', '--tum', str(whole)]) == 0
     lines = whole.read_text().splitlines(keepends=True)
     short.write_text(''.join(lines[: len(lines) // 10]))
     return whole, short

@@ -31,7 +31,7 @@ def completions(tmp_path: Path, line: str) -> list[str]:
     [
         ('slam-observer re', 'replay'),
         ('slam-observer replay --ma', '--map'),
-        ('slam-observer replay --gains sc', 'scheduled'),
+        ('slam-observer replay --gains co', 'constant'),
         ('slam-observer replay --set range_n', 'range_noise='),
         ('slam-observer replay --config whe', 'wheeled_bearing_range'),
         ('slam-observer config ste', 'stereo_inertial'),

@@ -38,7 +38,6 @@ def replayed(slam_observer, recordings, config, gains):
     ('gains', 'ate_m', 'configuration_m'),
     [
         ('constant', 0.081, 0.053),
-        ('scheduled', 0.048, 0.035),
         ('riccati', 0.041, 0.034),
     ],
 )
@@ -56,7 +55,6 @@ def test_starry_night(slam_observer, recordings, gains, ate_m, configuration_m):
     ('gains', 'ate_m', 'configuration_m'),
     [
         ('constant', 0.660, 1.027),
-        ('scheduled', 0.312, 0.348),
         ('riccati', 0.267, 0.284),
     ],
 )

@@ -111,7 +111,7 @@ def test_what_can_not_be_tuned_is_refused(slam_observer, tmp_path):
             writer.write_event(VelocityEvent(stamp_ns, np.zeros(6)))
             writer.write_event(ObservationEvent(stamp_ns, np.array([-1]), point))
     assert 'needs landmarks with ids' in slam_observer.fail('tune', path)
-    assert 'riccati' in slam_observer.fail('tune', path, '--gains', 'scheduled')
+    assert 'riccati' in slam_observer.fail('tune', path, '--gains', 'constant')
 
 
 def test_figures_of_a_kind_keep_their_proportions():

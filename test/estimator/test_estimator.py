@@ -112,7 +112,7 @@ def test_velocities_of_long_ago_are_not_kept():
     assert len(estimator._timeline.velocities.flat().stamps_ns) < 5_000
 
 
-@pytest.mark.parametrize('gains', ['riccati', 'scheduled', 'constant'])
+@pytest.mark.parametrize('gains', ['riccati', 'constant'])
 def test_pose_and_covariance_lead_on_along_the_velocities_together(gains):
     estimator = Estimator(Settings(reorder_window=0.0, gains=gains))
     turning = np.array([0.1, 0.0, 0.4, 1.0, 0.1, 0.0])
@@ -247,17 +247,15 @@ def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
     (said,) = caplog.messages
     assert said.startswith('No effect on riccati gains: gain_l, step_mode; ')
     caplog.clear()
-    Estimator(Settings(gains='scheduled', **asked)).reset()
-    Estimator(Settings(gains='constant', **asked))
+    Estimator(Settings(gains='constant', **asked)).reset()
     assert [message.partition(';')[0] for message in caplog.messages] == [
-        'No effect on scheduled gains: landmark_velocity_stddev',
         'No effect on constant gains: linear_bias_stddev, calibration_drift, '
         'landmark_velocity_stddev',
     ]
 
 
 def test_where_many_landmarks_seem_to_move_the_odometry_is_named(caplog):
-    estimator = Estimator(Settings(gains='scheduled', reorder_window=0.0, max_rejections=2))
+    estimator = Estimator(Settings(reorder_window=0.0, max_rejections=2))
     for step in range(500):
         estimator.add(velocity(0.1 * step, np.zeros(6)))
         times_moved = (step // 8 + 4 - np.arange(5)) // 5  # one after another
@@ -299,7 +297,7 @@ def test_while_there_is_room_no_landmark_makes_room_for_a_new_one():
 def test_by_default_a_map_does_not_grow_for_ever_and_it_is_said_once_when_it_is_full(caplog):
     limit = Settings().max_landmarks
     assert 500 <= limit <= 5000
-    estimator = Estimator(Settings(gains='scheduled', reorder_window=0.0))
+    estimator = Estimator(Settings(reorder_window=0.0))
     noise = np.random.default_rng(0)
     for step in range(12):
         estimator.add(velocity(0.1 * step))
@@ -418,7 +416,7 @@ def test_a_landmark_in_view_makes_no_room_though_its_point_is_rejected():
 
 def test_observations_in_a_row_of_which_all_landmarks_were_rejected_are_counted():
     """From which a place in a map is taken for wrong, or odometry for having slipped."""
-    estimator = Estimator(Settings(gains='scheduled', reorder_window=0.0, max_rejections=100))
+    estimator = Estimator(Settings(reorder_window=0.0, max_rejections=100))
     counted = []
     for step in range(12):
         off = 50.0 * (step in (6, 7, 8, 10, 11)) * np.array([1.0, -2.0, 3.0])
@@ -428,10 +426,9 @@ def test_observations_in_a_row_of_which_all_landmarks_were_rejected_are_counted(
     assert counted == [0, 0, 0, 0, 0, 0, 1, 2, 3, 0, 1, 2]
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_far_points_said_to_be_all_but_exact_are_taken_after_turning_blindly(gains):
+def test_far_points_said_to_be_all_but_exact_are_taken_after_turning_blindly():
     """Not by zeros, which say unknown."""
-    estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
+    estimator = Estimator(Settings(reorder_window=0.0))
     points = np.random.default_rng(1).uniform(-100.0, 100.0, size=(10, 3))
     velocity = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])
     exact = np.tile(1e-300 * np.eye(3), (4, 1, 1))
@@ -454,9 +451,8 @@ def test_only_settings_that_may_change_while_running_do():
     assert estimator.settings == Settings(gain_k=1.0, rejection_threshold=4.0)
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_settings_that_change_while_running_count_from_then_on(gains):
-    settings = Settings(gains=gains, reorder_window=0.0, max_hypotheses=1)
+def test_settings_that_change_while_running_count_from_then_on():
+    settings = Settings(reorder_window=0.0, max_hypotheses=1)
 
     def rejected(estimator, step):
         before = estimator.counts['rejected_landmark']
@@ -473,7 +469,6 @@ def test_settings_that_change_while_running_count_from_then_on(gains):
         assert rejected(estimator, 10) == expected
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 @pytest.mark.parametrize(
     ('model', 'noise'),
     [
@@ -486,8 +481,8 @@ def test_settings_that_change_while_running_count_from_then_on(gains):
         ('stereo', {'disparity_noise': 5.0}),
     ],
 )
-def test_noise_that_changes_while_running_counts_from_then_on(gains, model, noise):
-    before = Settings(gains=gains, observation_model=model, confirmations=1)
+def test_noise_that_changes_while_running_counts_from_then_on(model, noise):
+    before = Settings(observation_model=model, confirmations=1)
     changed, from_the_start = Estimator(before), Estimator(replace(before, **noise))
     changed.change_settings(replace(before, **noise))
     unchanged = Estimator(before)
@@ -496,10 +491,9 @@ def test_noise_that_changes_while_running_counts_from_then_on(gains, model, nois
             estimator.add(event)
     np.testing.assert_array_equal(changed.pose, from_the_start.pose)
     assert np.abs(changed.pose - unchanged.pose).max() > 1e-6
-    if gains == 'riccati':
-        covariances = [each.pose_covariance for each in (changed, from_the_start, unchanged)]
-        np.testing.assert_array_equal(*covariances[:2])
-        assert not np.allclose(*covariances[1:], rtol=1e-2, atol=0.0)
+    covariances = [each.pose_covariance for each in (changed, from_the_start, unchanged)]
+    np.testing.assert_array_equal(*covariances[:2])
+    assert not np.allclose(*covariances[1:], rtol=1e-2, atol=0.0)
 
 
 def stated(stamp_s, body_velocity, covariance):

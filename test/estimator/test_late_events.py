@@ -277,8 +277,7 @@ def test_a_velocity_later_than_the_limit_is_refused():
 
 
 def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
-    """Scheduled gains put off moving those that were out of view."""
-    settings = Settings(gains='scheduled', confirmations=1)
+    settings = Settings(confirmations=1)
     state = State(make_gains(settings, np.eye(4)), settings)
     event = observation(0.0, [0, 1])
     state_step.step(state, match(state, event))

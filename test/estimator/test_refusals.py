@@ -200,7 +200,7 @@ def test_points_with_one_id_are_left_out_counted_and_named(caplog, repeated):
 @pytest.mark.parametrize(
     ('wrong', 'expected'),
     [
-        ({'gains': 'x'}, "'gains' takes one of constant, scheduled, riccati, not 'x'"),
+        ({'gains': 'x'}, "'gains' takes one of constant, riccati, not 'x'"),
         ({'range_noise': -1.0}, "'range_noise' takes a value"),
         ({'linear_velocity_noise': (1.0, 2.0)}, 'a list of 3 numbers'),
     ],

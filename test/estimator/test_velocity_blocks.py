@@ -142,7 +142,7 @@ def assert_same_samples(one, other):
     disorder=st.sampled_from([0.0, 0.0, 0.1, 1.0]),
     has_imu=st.sampled_from([False, False, True]),
     has_covariances=st.booleans(),
-    gains=st.sampled_from(['riccati', 'riccati', 'scheduled', 'constant']),
+    gains=st.sampled_from(['riccati', 'riccati', 'constant']),
     changes=st.fixed_dictionaries(
         {},
         optional={

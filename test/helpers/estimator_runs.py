@@ -9,7 +9,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 
-GAINS = ('constant', 'scheduled', 'riccati')
+GAINS = ('constant', 'riccati')
 START_NS = 1_700_000_000_000_000_000
 LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 1], [0, 4, 0.5], [1, -4, 0], [2, 2, 2]])
 BODY_VELOCITY = np.array([0.05, -0.1, 0.3, 1.0, 0.1, -0.05])

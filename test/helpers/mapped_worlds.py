@@ -13,7 +13,7 @@ POINT_NOISE_M = 0.05
 MAP_NOISE_M = 0.03
 BODY_VELOCITY = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.1])
 PLANAR_VELOCITY = BODY_VELOCITY * [0, 0, 1, 1, 1, 0]
-GAINS = ('constant', 'scheduled', 'riccati')
+GAINS = ('constant', 'riccati')
 MODES = ('off', 'uncertain', 'fixed')
 
 

@@ -76,10 +76,10 @@ def test_a_map_without_covariances_is_read_back_without(tmp_path):
 
 def test_a_file_says_what_it_was_made_with_and_has_a_line_a_landmark(tmp_path):
     path = tmp_path / 'map.yaml'
-    write_map(path, a_map(9), Settings(gains='scheduled'))
+    write_map(path, a_map(9), Settings(gains='constant'))
     content = yaml.safe_load(path.read_text())
     assert content['package_version'] == __version__
-    assert content['settings']['gains'] == 'scheduled'
+    assert content['settings']['gains'] == 'constant'
     assert sum(line.startswith('- {id: ') for line in path.read_text().splitlines()) == 9
 
 

@@ -475,7 +475,7 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
 @pytest.mark.parametrize(
     ('parameters', 'reason'),
     [
-        ({'gains': 'ricati'}, "'gains' takes one of constant, scheduled, riccati, not 'ricati'"),
+        ({'gains': 'ricati'}, "'gains' takes one of constant, riccati, not 'ricati'"),
         ({'use_sim_time': 'ja'}, "Trying to set parameter 'use_sim_time' to 'ja'"),
     ],
 )

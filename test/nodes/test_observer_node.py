@@ -352,7 +352,7 @@ def test_parameter_misspelt_by_a_letter_is_refused_with_the_one_that_may_be_mean
 def test_parameters_under_the_name_of_another_node_are_reported_at_the_start(ros, tmp_path):
     file = tmp_path / 'robot.yaml'
     file.write_text(
-        'slam_node: {ros__parameters: {gains: scheduled, two_d_mode: true}}\n'
+        'slam_node: {ros__parameters: {gains: constant, two_d_mode: true}}\n'
         'amcl: {ros__parameters: {base_frame: base, min_particles: 500, max_particles: 900}}\n'
     )
     with running('observer_node', tmp_path / 'log', '--params-file', str(file)) as node:

@@ -68,11 +68,9 @@ def configuration_nees(estimator):
     return error @ np.linalg.solve(covariance_of(estimator), error)
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_a_robot_that_stands_knows_how_well_it_sees(gains):
+def test_a_robot_that_stands_knows_how_well_it_sees():
     still = replace(
         SETTINGS,
-        gains=gains,
         angular_velocity_noise=(1e-4,) * 3,
         linear_velocity_noise=(1e-4,) * 3,
         huber_threshold=0.0,

@@ -22,7 +22,6 @@ from slam_observer_ros.observer.robust import (
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 
-designs = pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 modes = pytest.mark.parametrize('two_d_mode', [False, True])
 
 
@@ -242,9 +241,8 @@ def test_a_landmark_is_forgotten_in_all_states_that_are_followed():
     assert estimator.landmark_counts[seen_since] == 10
 
 
-@designs
-def test_a_rejected_observation_says_nothing_of_how_its_landmark_moves(gains):
-    settings = Settings(gains=gains)
+def test_a_rejected_observation_says_nothing_of_how_its_landmark_moves():
+    settings = Settings()
     world = drive(settings, 10.0, landmarks=5, seen=5)
 
     def throw(index, event):
@@ -261,10 +259,9 @@ def test_a_rejected_observation_says_nothing_of_how_its_landmark_moves(gains):
     np.testing.assert_array_equal(estimator.landmark_velocities, 0.0)
 
 
-@designs
 @modes
-def test_gross_outliers_do_not_throw_the_pose(gains, two_d_mode):
-    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+def test_gross_outliers_do_not_throw_the_pose(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
     clean, disturbed, rejected = [], [], 0
     for seed in range(3):
         world = drive(settings, 20.0, seed, seen=5)
@@ -285,10 +282,9 @@ def test_gross_outliers_do_not_throw_the_pose(gains, two_d_mode):
     assert np.mean(disturbed) < 1.5 * np.mean(clean)
 
 
-@designs
 @modes
-def test_an_outlier_at_first_sight_does_not_survive(gains, two_d_mode):
-    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+def test_an_outlier_at_first_sight_does_not_survive(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
     world = drive(settings, 20.0)
     first = world.observations()[0].ids[0]
 
@@ -304,10 +300,9 @@ def test_an_outlier_at_first_sight_does_not_survive(gains, two_d_mode):
     assert position_error_m(estimator, world) < position_error_m(clean, world) + 0.2
 
 
-@designs
-def test_a_landmark_gives_way_once_it_was_contradicted_more_often_than_seen(gains):
+def test_a_landmark_gives_way_once_it_was_contradicted_more_often_than_seen():
     """Seen twice at a wrong position and five times at the right one, then out of view."""
-    settings = Settings(gains=gains, confirmations=3)
+    settings = Settings(confirmations=3)
     world = drive(settings, 5.0, landmarks=5, seen=5)
 
     def throw(index, event):
@@ -322,9 +317,8 @@ def test_a_landmark_gives_way_once_it_was_contradicted_more_often_than_seen(gain
     assert np.linalg.norm(estimator.world_points[row] - world.world_points[2]) < 1.0
 
 
-@designs
-def test_a_landmark_seen_twice_outlives_an_outlier(gains):
-    settings = Settings(gains=gains)
+def test_a_landmark_seen_twice_outlives_an_outlier():
+    settings = Settings()
     world = drive(settings, 5.0, landmarks=5, seen=5)
 
     def throw(index, event):
@@ -336,11 +330,10 @@ def test_a_landmark_seen_twice_outlives_an_outlier(gains):
     assert estimator.landmark_counts[row] == len(world.observations()) - 1
 
 
-@designs
 @modes
-def test_a_landmark_that_moved_is_recognised_and_taken_for_new(gains, two_d_mode, caplog):
+def test_a_landmark_that_moved_is_recognised_and_taken_for_new(two_d_mode, caplog):
     settings = Settings(
-        gains=gains, two_d_mode=two_d_mode, relinearization_interval=10, relinearization_angle=0.0
+        two_d_mode=two_d_mode, relinearization_interval=10, relinearization_angle=0.0
     )
     world = drive(settings, 20.0, landmarks=5, seen=5)
 
@@ -361,10 +354,9 @@ def test_a_landmark_that_moved_is_recognised_and_taken_for_new(gains, two_d_mode
     assert estimator.landmark_counts[row] == len(world.observations()) - 40 - 4
 
 
-@designs
 @modes
-def test_swapped_ids_do_no_harm(gains, two_d_mode):
-    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+def test_swapped_ids_do_no_harm(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
     world = drive(settings, 20.0, landmarks=5, seen=5)
 
     def swap(index, event):
@@ -382,9 +374,8 @@ def test_swapped_ids_do_no_harm(gains, two_d_mode):
     assert error_m < 1.3 * clean_m + 0.02
 
 
-@designs
-def test_outliers_at_ever_other_positions_are_not_taken_for_a_landmark_that_moved(gains):
-    settings = Settings(gains=gains)
+def test_outliers_at_ever_other_positions_are_not_taken_for_a_landmark_that_moved():
+    settings = Settings()
     world = drive(settings, 20.0, landmarks=5, seen=5)
     random = np.random.default_rng(0)
 
@@ -400,10 +391,9 @@ def test_outliers_at_ever_other_positions_are_not_taken_for_a_landmark_that_move
     assert np.linalg.norm(estimator.world_points[row] - world.world_points[2]) < 0.6
 
 
-@designs
-def test_all_landmarks_moved_together_are_followed_again(gains):
+def test_all_landmarks_moved_together_are_followed_again():
     """As when the robot was carried: none of them differs from another by its residual."""
-    settings = Settings(gains=gains)
+    settings = Settings()
     world = drive(settings, 25.0, landmarks=5, seen=5)
 
     def carry(index, event):

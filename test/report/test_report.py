@@ -65,10 +65,9 @@ def test_a_report_has_path_truth_map_and_residuals_in_one_file(report):
     assert report.stat().st_size < 2 * MEGABYTE
 
 
-@pytest.mark.parametrize('gains', ['constant', 'scheduled'])
-def test_what_gains_do_not_know_is_left_out(slam_observer, tmp_path, gains):
+def test_what_gains_do_not_know_is_left_out(slam_observer, tmp_path):
     recording, report = write_mcap(tmp_path / 'run.mcap'), tmp_path / 'run.html'
-    slam_observer.succeed('replay', recording, '--gains', gains, '--report', report)
+    slam_observer.succeed('replay', recording, '--gains', 'constant', '--report', report)
     assert 'nis' not in numbers_of(report)['consistency']
 
 

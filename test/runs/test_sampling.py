@@ -64,7 +64,7 @@ def test_memory_does_not_grow_with_a_replay_of_which_not_all_is_kept():
 
     tracemalloc.start()
     try:
-        result = replay(events(), Settings(gains='scheduled'), keep_all=False)
+        result = replay(events(), Settings(gains='constant'), keep_all=False)
     finally:
         tracemalloc.stop()
     assert held_bytes[1] - held_bytes[0] < 2000  # a byte a message

@@ -104,10 +104,9 @@ def test_a_gyroscopes_bias_is_found_within_three_sigma(seed):
     np.testing.assert_array_equal(found[3:], 0.0)
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_a_robot_whose_wheels_stand_does_not_turn_by_a_bias(gains):
+def test_a_robot_whose_wheels_stand_does_not_turn_by_a_bias():
     world = drive(GYROSCOPE, 60.0, bias=GYROSCOPE_BIAS)
-    estimator = estimate(world, with_gains(GYROSCOPE, gains))
+    estimator = estimate(world, GYROSCOPE)
     start_ns = estimator.stamp_ns
     estimator.add(VelocityEvent(start_ns + 1, np.zeros(6)))
     estimator.flush()
@@ -177,10 +176,8 @@ def test_a_late_odometry_is_named_and_no_scale_beside_it():
     assert '0.15 s early' in of_calibration([replace(late, value=-0.15)])[0].what
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_a_delay_that_is_made_up_for_does_no_harm(gains):
+def test_a_delay_that_is_made_up_for_does_no_harm():
     settings = Settings(
-        gains=gains,
         two_d_mode=True,
         angular_velocity_noise=(0.0, 0.0, 0.01),
         velocity_delay_stddev=0.0,
@@ -281,15 +278,7 @@ def test_a_robot_at_rest_again_is_where_its_velocities_say_whatever_their_delay(
     assert deviation < 1e-6
 
 
-def test_scheduled_gains_find_them_too():
-    settings = with_gains(WHEELS, 'scheduled')
-    world = drive(settings, 60.0, scale=WHEEL_SCALE)
-    found, _ = scale_and_bias(estimate(world, settings))
-    np.testing.assert_allclose(found, WHEEL_SCALE, atol=0.025)
-
-
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_calibration_makes_the_map_better_where_the_wheels_are_off(gains):
+def test_calibration_makes_the_map_better_where_the_wheels_are_off():
     def mean_error_m(settings):
         errors = []
         for seed in range(4):
@@ -297,11 +286,11 @@ def test_calibration_makes_the_map_better_where_the_wheels_are_off(gains):
             errors.append(configuration_error_m(estimate(world, settings), world))
         return np.mean(errors)
 
-    off = Settings(gains=gains, two_d_mode=True)
-    assert mean_error_m(with_gains(WHEELS, gains)) < mean_error_m(off)
+    off = Settings(two_d_mode=True)
+    assert mean_error_m(WHEELS) < mean_error_m(off)
 
 
-@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('gains', ['constant', 'riccati'])
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
     settings = Settings(
@@ -324,9 +313,8 @@ def rms_error_and_moved(settings, worlds):
     return np.sqrt(np.mean(np.square(errors_m))), moved
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_a_small_yaw_bias_is_estimated_unasked(gains):
-    settings = Settings(gains=gains, two_d_mode=True)
+def test_a_small_yaw_bias_is_estimated_unasked():
+    settings = Settings(two_d_mode=True)
     bias = np.array([0.0, 0.0, 0.001, 0.0, 0.0, 0.0])
     worlds = [drive(settings, 60.0, seed, noise=0.0, bias=bias) for seed in range(2)]
     error_m, moved = rms_error_and_moved(settings, worlds)
@@ -335,10 +323,8 @@ def test_a_small_yaw_bias_is_estimated_unasked(gains):
     assert moved == 0
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_a_precise_robot_does_not_take_its_yaw_bias_for_moved_landmarks(gains):
+def test_a_precise_robot_does_not_take_its_yaw_bias_for_moved_landmarks():
     settings = Settings(
-        gains=gains,
         two_d_mode=True,
         angular_velocity_noise=(0.001, 0.001, 0.001),
         linear_velocity_noise=(0.005, 0.005, 0.005),
@@ -354,10 +340,9 @@ def test_a_precise_robot_does_not_take_its_yaw_bias_for_moved_landmarks(gains):
     assert moved == 0 < moved_left
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_where_there_is_no_bias_estimating_it_costs_next_to_nothing(gains, two_d_mode):
-    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+def test_where_there_is_no_bias_estimating_it_costs_next_to_nothing(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
     worlds = [drive(settings, 60.0, seed) for seed in range(6)]
     error_m, moved = rms_error_and_moved(settings, worlds)
     left_alone = replace(settings, angular_bias_stddev=NO_BIAS)
@@ -417,18 +402,15 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
         np.testing.assert_allclose(F[:, column], error, atol=1e-3 * dt_s * pieces)
 
 
-@pytest.mark.parametrize('gains', ['riccati', 'scheduled'])
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_one_more_state_of_velocities_takes_two_parameters_and_a_row(
-    monkeypatch, gains, two_d_mode
-):
+def test_one_more_state_of_velocities_takes_two_parameters_and_a_row(monkeypatch, two_d_mode):
     sideways, turning = 4, 2
     row = Entry('side_slip', 'side_slip', None, 7 * sideways + turning, 'm/rad')
     with_row = (*OF_VELOCITY[:-1], row, OF_VELOCITY[-1])
     monkeypatch.setattr(calibrations, 'OF_VELOCITY', with_row)
     monkeypatch.setattr(Settings, 'side_slip', 0.0, raising=False)
     monkeypatch.setattr(Settings, 'side_slip_stddev', 0.2, raising=False)
-    settings = Settings(gains=gains, two_d_mode=two_d_mode, reorder_window=0.0)
+    settings = Settings(two_d_mode=two_d_mode, reorder_window=0.0)
     slips = np.zeros((600, 6))
     slips[:, sideways] = 0.1 * true_velocities(600, two_d_mode)[:, turning]
     estimator = estimate(drive(settings, 30.0, bias=slips), settings)
@@ -528,7 +510,7 @@ def test_a_bias_that_may_drift_is_plausible_wherever_it_is():
     assert not of_calibration(estimator.calibration)
 
 
-@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('gains', ['constant', 'riccati'])
 def test_what_is_stated_of_the_velocity_is_used(gains):
     scale, bias = np.array([1.1, 0.9, 1.05, 0.95, 1.02, 0.97]), np.full(6, 0.01)
     stated = Settings(

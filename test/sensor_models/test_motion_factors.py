@@ -209,5 +209,5 @@ def test_a_clearly_noisier_odometry_is_named_with_the_line_to_paste():
 
 
 def test_only_riccati_gains_have_factors():
-    estimator = estimate(drive(RIGHT, 5.0), replace(RIGHT, gains='scheduled'))
+    estimator = estimate(drive(RIGHT, 5.0), replace(RIGHT, gains='constant'))
     assert estimator.motion_factors == []

@@ -160,10 +160,9 @@ def test_a_variance_that_rounding_left_below_zero_is_taken_for_zero():
     np.testing.assert_allclose(covariance, given, atol=1e-11)
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 @pytest.mark.parametrize('variance', [1e15, 1e100, np.finfo(np.float64).max])
-def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(gains, variance):
-    estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
+def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(variance):
+    estimator = Estimator(Settings(reorder_window=0.0))
     points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 3.0], [2.0, 2.0, 1.0]])
     for step in range(20):
         known = np.full(6, 1e-4)
@@ -410,13 +409,12 @@ def test_known_landmarks_weigh_the_same_whether_seen_too_near_or_too_far(setting
     np.testing.assert_allclose(near, far, rtol=5e-3)
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor(gains):
+def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor():
     """A sensor on a mast 8 m ahead of the base, 2 m from what it sees."""
     sensor = se3.pose(np.eye(3), np.array([8.0, 0.0, 0.0]))
     sights = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
     noise = {'bearing_noise': 0.1, 'range_noise': 0.05}
-    settings = Settings(gains=gains, reorder_window=0.0, confirmations=1, **noise)
+    settings = Settings(reorder_window=0.0, confirmations=1, **noise)
     estimator = Estimator(settings)
     for step in range(5):
         estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
@@ -426,11 +424,10 @@ def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor(ga
     np.testing.assert_allclose(match(estimator._state, event).covariances, expected, rtol=0.01)
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_the_range_that_counts_is_expected_and_the_direction_measured(gains):
+def test_the_range_that_counts_is_expected_and_the_direction_measured():
     """As a state whose heading is off by 0.2 rad sees a stereo camera's point, and 1 m too far."""
     noise = {'observation_model': 'stereo', 'stereo_baseline': 0.1}
-    estimator = Estimator(Settings(gains=gains, reorder_window=0.0, confirmations=1, **noise))
+    estimator = Estimator(Settings(reorder_window=0.0, confirmations=1, **noise))
     points = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]])
     estimator.add(VelocityEvent(0, np.zeros(6)))
     estimator.add(ObservationEvent(0, np.arange(3), points))
@@ -440,11 +437,10 @@ def test_the_range_that_counts_is_expected_and_the_direction_measured(gains):
     np.testing.assert_allclose(found, observed(turned, **noise), rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_of_a_landmark_in_doubt_what_counts_is_where_it_was_measured(gains):
+def test_of_a_landmark_in_doubt_what_counts_is_where_it_was_measured():
     """One that is not is as uncertain as where it should be is far."""
     noise = {'bearing_noise': 0.1, 'range_noise': 0.05}
-    estimator = Estimator(Settings(gains=gains, reorder_window=0.0, **noise))
+    estimator = Estimator(Settings(reorder_window=0.0, **noise))
     points = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]])
     for step in range(5):
         estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
@@ -476,11 +472,10 @@ def awkward_observations():
 
 @pytest.mark.parametrize('case', awkward_observations())
 @pytest.mark.parametrize('model', ['range_bearing', 'stereo', 'cartesian'])
-@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_no_observation_is_so_exact_that_it_ends_the_estimator(case, model, gains, two_d_mode):
+def test_no_observation_is_so_exact_that_it_ends_the_estimator(case, model, two_d_mode):
     points, covariance = awkward_observations()[case]
-    settings = Settings(gains=gains, two_d_mode=two_d_mode, observation_model=model)
+    settings = Settings(two_d_mode=two_d_mode, observation_model=model)
     covariances = None if covariance is None else np.tile(covariance, (2, 1, 1))
     estimator = Estimator(settings)
     for step in range(4):

@@ -26,7 +26,6 @@ OTHERS = [row for row in LIVE if row not in NOISE + LIMITS]
 
 AFFECTED_BY = {
     'constant': {'gain_k', 'gain_l', 'step_mode', 'max_innovation_time'},
-    'scheduled': {'gain_k', 'huber_threshold', 'rejection_threshold'},
     'riccati': {'gain_k', 'huber_threshold', 'rejection_threshold'},
 }
 """What a setting changes; ``gain_k`` is in the Lyapunov value of all."""

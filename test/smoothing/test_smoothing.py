@@ -463,7 +463,6 @@ def test_an_estimator_that_has_seen_nothing_has_nothing_to_smooth():
     'changes',
     [
         {'gains': 'constant'},
-        {'gains': 'scheduled'},
         {'relinearization_interval': 0},
         {'landmark_velocity_stddev': 0.1},
     ],

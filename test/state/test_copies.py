@@ -26,7 +26,6 @@ EVERYTHING = Settings(
 )
 KINDS = {
     'constant': Settings(reorder_window=0.0, gains='constant'),
-    'scheduled': Settings(reorder_window=0.0, gains='scheduled'),
     'riccati': EVERYTHING,
     'in a plane': Settings(reorder_window=0.0, two_d_mode=True),
     'moving landmarks': Settings(reorder_window=0.0, landmark_velocity_stddev=0.1),

@@ -207,7 +207,7 @@ class Backlog:
             return ''
         return (
             f"the node does not keep up: messages on '{topic}' wait {self.wait_s:.1f} s to be "
-            'read; send fewer of them, or make observations cheaper (gains: scheduled, '
+            'read; send fewer of them, or make observations cheaper ('
             'max_landmarks)'
         )
 
@@ -283,7 +283,7 @@ class LoadShedding:
         return (
             f"the node does not keep up: of {rate_hz:.1f} messages a second on '{topic}' "
             f'it uses {used_hz:.1f}, the newest (dropped: overload); send no more than that, or '
-            'fewer points in each, or make observations cheaper (gains: scheduled, max_landmarks)'
+            'fewer points in each, or make observations cheaper (max_landmarks)'
         )
 
     def _forget_before(self, steady_s: float) -> None:
