@@ -25,7 +25,7 @@ LOCK = $(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python
 	--constraint constraints.txt --custom-compile-command 'make lock'
 
 .DEFAULT_GOAL := help
-.PHONY: help demo robot test lint format pytest colcon docs benchmark benchmark-accuracy venv \
+.PHONY: help demo robot test lint format pytest sanitize colcon docs benchmark benchmark-accuracy venv \
 	develop lock clean
 
 help:  ## list these targets
@@ -56,6 +56,9 @@ format: $(READY_TO_DEVELOP)  ## let ruff mend style and layout
 pytest: $(READY_TO_DEVELOP) $(CORE)  ## the tests alone
 	scripts/ensure_chromium.sh
 	$(PYTHON_IN_VENV) -m pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
+
+sanitize: $(READY_TO_DEVELOP)  ## look longer than the tests for reads and writes out of bounds in C
+	PYTHONPATH=$(CURDIR) $(PYTHON_IN_VENV) test/helpers/sanitized.py 1000
 
 colcon: $(READY_TO_DEVELOP)  ## build, install and test as a ROS workspace does
 	scripts/colcon_check.sh $(VENV)

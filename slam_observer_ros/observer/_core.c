@@ -122,7 +122,7 @@ typedef struct {
 
 static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
     static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "i", "b", "d67",
-                                        "lv", "dcc", NULL};
+                                        "xv", "dcc", NULL};
     if (!read_fields(door, tuple, specs, x, "Estimate"))
         return 0;
     x->p = x->is_planar ? 3 : 6;
@@ -190,7 +190,7 @@ typedef struct {
 } Seen;
 
 static int read_seen(Door *door, PyObject *tuple, const Estimate *x, Seen *seen) {
-    static const char *const specs[] = {"i", "lm", "dm3", "~dm3", "~dm33", "~d7", "ls", "i", NULL};
+    static const char *const specs[] = {"i", "xm", "dm3", "~dm3", "~dm33", "~d7", "xs", "i", NULL};
     if (!read_fields(door, tuple, specs, seen, "Seen"))
         return 0;
     seen->m = (long)door->sizes['m'];
@@ -653,8 +653,6 @@ static int advance(const Estimate *x, const Velocities *v, const Interval *inter
 
 /* --------------------------------------------------------------- an observation: (28) to (31) */
 
-enum { MAX_SEEN = 64 };
-
 /* What m points say against the state, in the reference frame, on k axes: M = m k, q = p + c. */
 typedef struct {
     long m, M, q;
@@ -666,6 +664,7 @@ typedef struct {
     double *repeated;        /* (m) by how much R grows, as errors last */
     double *predicted, *S, *L, *z, *S_inv_r; /* (M, M) C P C' and with noise, its factor; (M) */
     double *C, *T;           /* (M, q) and P's rows of the landmarks there */
+    double *half;            /* (q) */
     double *W, *dx;          /* (M, N); (N) */
     double *weights;
 } Residuals;
@@ -679,7 +678,7 @@ static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory)
 #define TAKE(field, count) (res->field = memory ? memory + used : NULL, used += (count))
     TAKE(points, 3 * n), TAKE(stated, 9 * n), TAKE(r, M), TAKE(R, M * k), TAKE(D, M * c);
     TAKE(repeated, n), TAKE(predicted, M * M), TAKE(S, M * M), TAKE(L, M * M), TAKE(z, M);
-    TAKE(S_inv_r, M), TAKE(C, M * q), TAKE(T, M * q), TAKE(W, M * (size_t)x->N);
+    TAKE(S_inv_r, M), TAKE(C, M * q), TAKE(T, M * q), TAKE(half, q), TAKE(W, M * (size_t)x->N);
     TAKE(dx, (size_t)x->N), TAKE(weights, n);
 #undef TAKE
     return used;
@@ -879,7 +878,7 @@ static void fill_predicted(const Estimate *x, const Observed *out, Residuals *re
     }
     for (long i = 0; i < M; i++) {
         const double *C = res->C + i * q, *own = x->P + column_of(x, res, i) * x->room;
-        double half[64], *T = res->T + i * q;
+        double *half = res->half, *T = res->T + i * q;
         memcpy(T, own, (size_t)q * sizeof(double));
         for (long t = 0; t < q; t++) {
             half[t] = -T[t];
@@ -1017,10 +1016,13 @@ static void step_factors(const Factors *factors, const double g[2], const double
 }
 
 /* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms
- * has it, which may be less than is applied; 0 if it is indefinite. ``work``: M (M + p + 1). */
+ * has it, which may be less than is applied; 0 if it is indefinite. ``work``: M (M + p + 1), and
+ * ``at``: 2 M. */
 static int learn(const Estimate *x, const Factors *factors, double gate, const Observed *out,
-                 const Residuals *res, double *work, double logs[2], double information[4]) {
-    int p = x->p, k = res->k, at[3 * MAX_SEEN], kept[3 * MAX_SEEN];
+                 const Residuals *res, double *work, i64 *at, double logs[2],
+                 double information[4]) {
+    int p = x->p, k = res->k;
+    i64 *kept = at + res->M;
     double N[72], change[36] = {0.0}, u[6] = {0.0}, G[36] = {0.0}, g[2], F[4];
     double *L = work, *Y = L + res->M * res->M, *z = Y + res->M * p, squared;
     for (int j = 0; j < 2; j++) {
@@ -1031,7 +1033,7 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
         }
     }
     long M = res->M, passed; /* entries ``at`` of the residuals: at first all */
-    for (int i = 0; i < M; i++)
+    for (long i = 0; i < M; i++)
         at[i] = i;
     for (;;) {
         for (long i = 0; i < M; i += k) { /* C in the middle between expected and seen */
@@ -1067,7 +1069,7 @@ static int learn(const Estimate *x, const Factors *factors, double gate, const O
         if (squared <= gate * gate || 2 * passed <= M || passed == M)
             break;
         M = passed; /* some few are left out */
-        memcpy(at, kept, sizeof at);
+        memcpy(at, kept, (size_t)M * sizeof(i64));
     }
     solve_lower_rows(L, M, Y, p, p);
     for (long i = 0; i < M; i++)
@@ -1213,22 +1215,23 @@ static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
 static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Factors *factors,
                    const Observed *out) {
-    if (seen->m < 1 || seen->m > MAX_SEEN || x->c > 64 || !is_stamp(seen->stamp_ns)
+    if (seen->m < 1 || !is_stamp(seen->stamp_ns)
         || x->stride != x->k)
         return UNUSUAL;
     Residuals res;
     size_t numbers = lay_out(&res, x, seen->m, NULL), M = (size_t)res.M;
     size_t work_size = M * (M + (size_t)x->p + 1);
-    double *memory = PyMem_Malloc((numbers + work_size) * sizeof(double));
+    double *memory = PyMem_Malloc((numbers + work_size + 2 * M) * sizeof(double));
     if (memory == NULL)
         return UNUSUAL;
     lay_out(&res, x, seen->m, memory);
     double *work = memory + numbers, logs[2], information[4];
+    i64 *at = (i64 *)(work + work_size); /* 8 bytes each, as numbers are */
     int status = UNUSUAL;
     if (fill_residuals(x, table, seen, figures, limits, out, &res))
         status = judge(x, limits, out, &res);
     if (status != UNUSUAL && factors->are_there
-        && !learn(x, factors, limits->gate, out, &res, work, logs, information))
+        && !learn(x, factors, limits->gate, out, &res, work, at, logs, information))
         status = UNUSUAL;
     if (status == DONE && !(fill_weights(limits->huber, &res, work) && correct(x, &res, work)))
         status = UNUSUAL;

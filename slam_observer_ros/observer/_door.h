@@ -1,5 +1,7 @@
 /* The door of a compiled module: tuples of arrays become structs, and all that could be read or
- * written beyond an array's end is checked. */
+ * written beyond an array's end is checked. What is an index into something else is copied, so
+ * that nobody can change it after it was checked; and reading a number runs no Python code, which
+ * might move an array that was read before. */
 #ifndef SLAM_OBSERVER_DOOR_H
 #define SLAM_OBSERVER_DOOR_H
 
@@ -11,20 +13,21 @@
 
 typedef int64_t i64;
 
-enum { MAX_ARRAYS = 48, SIZES = 128, UNBOUND = -1 };
+enum { MAX_ARRAYS = 48, MAX_COPIES = 8, SIZES = 128, UNBOUND = -1 };
 
-/* Views of all arrays of a call, and the sizes that letters stand for in their shapes: what the
- * first array with a letter has there, or what it was set to. */
+/* Views of all arrays of a call, copies of those that are indices, and the sizes that letters
+ * stand for in shapes: what the first array with a letter has there, or what it was set to. */
 typedef struct {
     Py_buffer views[MAX_ARRAYS];
-    int count;
+    void *copies[MAX_COPIES];
+    int count, copied;
     Py_ssize_t sizes[SIZES];
 } Door;
 
 typedef char members_have_8_bytes[sizeof(void *) == 8 && sizeof(double) == 8 ? 1 : -1];
 
 static inline void open_door(Door *door) {
-    door->count = 0;
+    door->count = door->copied = 0;
     for (int letter = 0; letter < SIZES; letter++)
         door->sizes[letter] = letter >= '0' && letter <= '9' ? letter - '0' : UNBOUND;
 }
@@ -32,6 +35,8 @@ static inline void open_door(Door *door) {
 static inline void close_door(Door *door) {
     while (door->count)
         PyBuffer_Release(&door->views[--door->count]);
+    while (door->copied)
+        PyMem_Free(door->copies[--door->copied]);
 }
 
 static inline int refuse(const char *what) {
@@ -39,11 +44,24 @@ static inline int refuse(const char *what) {
     return 0;
 }
 
+/* A copy that lasts until the door is closed; NULL with an error. */
+static inline void *copy_at_door(Door *door, const Py_buffer *view, const char *what) {
+    void *copy = door->copied < MAX_COPIES ? PyMem_Malloc((size_t)view->len + 1) : NULL;
+    if (copy == NULL) {
+        refuse(what);
+        return NULL;
+    }
+    if (view->len)
+        memcpy(copy, view->buf, (size_t)view->len);
+    return door->copies[door->copied++] = copy;
+}
+
 /* The address of an array as ``spec`` describes it, a kind and its shape; NULL with an error. */
 static inline void *read_array(Door *door, PyObject *array, const char *spec, const char *what) {
     static double nothing; /* of an array without entries there may be no address */
-    char kind = spec[0] == 'D' ? 'd' : spec[0] == 'L' ? 'l' : spec[0];
-    int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (kind == spec[0] ? 0 : PyBUF_WRITABLE);
+    int is_written = spec[0] == 'D' || spec[0] == 'L';
+    char kind = spec[0] == 'D' ? 'd' : spec[0] == 'L' || spec[0] == 'x' ? 'l' : spec[0];
+    int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (is_written ? PyBUF_WRITABLE : 0);
     Py_buffer *view = &door->views[door->count];
     if (door->count == MAX_ARRAYS || PyObject_GetBuffer(array, view, flags)) {
         if (!PyErr_Occurred())
@@ -61,12 +79,29 @@ static inline void *read_array(Door *door, PyObject *array, const char *spec, co
     }
     if (!is_fit)
         refuse(what);
+    else if (spec[0] == 'x')
+        return copy_at_door(door, view, what);
     return !is_fit ? NULL : view->buf == NULL ? &nothing : view->buf;
 }
 
+/* Read a number of a kind as it lies in an object of Python's own types: no method is called. */
+static inline int read_number(PyObject *item, char kind, char *member, const char *what) {
+    if (kind == 'f' ? !PyFloat_Check(item) && !PyLong_Check(item) : !PyLong_Check(item))
+        return refuse(what);
+    if (kind == 'f') {
+        double number = PyFloat_Check(item) ? PyFloat_AS_DOUBLE(item) : PyLong_AsDouble(item);
+        memcpy(member, &number, 8);
+    } else {
+        i64 integer = PyLong_AsLongLong(item);
+        integer = kind == 'b' ? integer != 0 : integer;
+        memcpy(member, &integer, 8);
+    }
+    return !PyErr_Occurred();
+}
+
 /* Read a tuple into a struct whose first members are its fields, 8 bytes each: by their specs, an
- * int64 i, a number f, a truth b, or an array of float64 d, int64 l or bool ?, in capitals where
- * it is written to; after ~ it may be None, and is NULL then. */
+ * int64 i, a number f, a truth b, or an array of float64 d, int64 l, indices x or bool ?, in
+ * capitals where it is written to; after ~ it may be None, and is NULL then. */
 static inline int read_fields(Door *door, PyObject *tuple, const char *const specs[], void *fields,
                        const char *what) {
     Py_ssize_t count = 0;
@@ -78,19 +113,16 @@ static inline int read_fields(Door *door, PyObject *tuple, const char *const spe
         PyObject *item = PyTuple_GET_ITEM(tuple, i);
         const char *spec = specs[i] + (specs[i][0] == '~');
         char *member = (char *)fields + 8 * i;
-        if (spec[0] == 'f') {
-            double number = PyFloat_AsDouble(item);
-            memcpy(member, &number, 8);
-        } else if (spec[0] == 'i' || spec[0] == 'b') {
-            i64 integer = spec[0] == 'i' ? PyLong_AsLongLong(item) : PyObject_IsTrue(item);
-            memcpy(member, &integer, 8);
-        } else {
-            int is_none = spec != specs[i] && item == Py_None;
-            void *address = is_none ? NULL : read_array(door, item, spec, what);
-            memcpy(member, &address, 8);
+        int is_none = spec != specs[i] && item == Py_None;
+        if (spec[0] == 'f' || spec[0] == 'i' || spec[0] == 'b') {
+            if (!read_number(item, spec[0], member, what))
+                return 0;
+            continue;
         }
-        if (PyErr_Occurred())
+        void *address = is_none ? NULL : read_array(door, item, spec, what);
+        if (address == NULL && !is_none)
             return 0;
+        memcpy(member, &address, 8);
     }
     return 1;
 }

@@ -33,7 +33,7 @@ static int are_in_order(const i64 *numbers, long count) {
 }
 
 static int read_equations(Door *door, PyObject *tuple, Equations *eq) {
-    static const char *const specs[] = {"DSdd", "DAdd", "DSdc", "lM",  "lM", "DMdk",
+    static const char *const specs[] = {"DSdd", "DAdd", "DSdc", "xM",  "xM", "DMdk",
                                         "Ddb",  "Dbb",  "DSd",  "Db", NULL};
     if (!read_fields(door, tuple, specs, eq, "Equations"))
         return 0;
@@ -101,8 +101,8 @@ static int read_prior(Door *door, PyObject *tuple, const Equations *eq, Prior *p
 }
 
 static int read_seen(Door *door, PyObject *tuple, const Equations *eq, Seen *seen) {
-    static const char *const specs[] = {"dM3", "dMkk", "dM",  "~lM",
-                                        "~dM3", "~dM3", "dv7", "lv7", NULL};
+    static const char *const specs[] = {"dM3", "dMkk", "dM",  "~xM",
+                                        "~dM3", "~dM3", "dv7", "xv7", NULL};
     if (!read_fields(door, tuple, specs, seen, "Seen"))
         return 0;
     Py_ssize_t count = door->sizes['v'];
@@ -494,9 +494,14 @@ typedef struct {
     long *columns, *slots, *begins, width;
 } Stretch;
 
-/* Return how many numbers a stretch needs, beside as many integers; lay them out, if there are. */
-static long lay_out(const Equations *eq, const Chain *chain, double *memory, long *integers,
+typedef struct {
+    size_t numbers, integers;
+} Room;
+
+/* Lay the arrays of a stretch out in memory, or count what they take. */
+static Room lay_out(const Equations *eq, const Chain *chain, double *memory, long *integers,
                     Stretch *stretch) {
+    Room used = {0, 0};
     long d = eq->d, most = 0;
     for (long m = 0, first = 0; m < eq->M; m++) {
         while (eq->poses[first] / STRIDE < eq->poses[m] / STRIDE)
@@ -504,15 +509,18 @@ static long lay_out(const Equations *eq, const Chain *chain, double *memory, lon
         most = m + 1 - first > most ? m + 1 - first : most;
     }
     long width = 2 * d + eq->c + eq->k * (chain->J ? most : 0) + 1;
+#define TAKE(field, memory, used, count) \
+    (stretch->field = memory ? memory + used : NULL, used += (size_t)(count))
+    TAKE(T, memory, used.numbers, INNER * d * d);
+    TAKE(links, memory, used.numbers, INNER * d * d);
+    TAKE(rows, memory, used.numbers, INNER * d * width);
+    TAKE(ends, memory, used.numbers, width);
+    TAKE(lost, memory, used.numbers, width > d * d ? width : d * d);
+    TAKE(columns, integers, used.integers, width);
+    TAKE(slots, integers, used.integers, eq->n);
+    TAKE(begins, integers, used.integers, eq->S + 1);
+#undef TAKE
     if (memory != NULL) {
-        stretch->T = memory;
-        stretch->links = stretch->T + INNER * d * d;
-        stretch->rows = stretch->links + INNER * d * d;
-        stretch->ends = stretch->rows + INNER * d * width;
-        stretch->lost = stretch->ends + width;
-        stretch->columns = integers;
-        stretch->slots = stretch->columns + width;
-        stretch->begins = stretch->slots + eq->n;
         for (long i = 0; i < eq->n; i++)
             stretch->slots[i] = -1;
         for (long s = 0, m = 0; s <= eq->S; s++) {
@@ -521,7 +529,7 @@ static long lay_out(const Equations *eq, const Chain *chain, double *memory, lon
             stretch->begins[s] = m;
         }
     }
-    return INNER * d * (2 * d + width) + 2 * width + eq->n + eq->S + 1;
+    return used;
 }
 
 /* Take up stretch j and eliminate its poses; 0 where their T is not positive definite. */
@@ -552,7 +560,7 @@ static int eliminate_stretch(const Equations *eq, long j, Stretch *stretch) {
             add_block(rows + stretch->slots[eq->landmarks[m]], width, eq->seen + m * d * k, k, d,
                       k);
     }
-    transposed(above, d, stretch->lost); /* to the start; there is room in what is not used yet */
+    transposed(above, d, stretch->lost); /* to the start, in what is not used yet */
     add_block(stretch->rows, width, stretch->lost, d, d, d);
     add_block(stretch->rows + (INNER - 1) * d * width + d, width, above + INNER * d * d, d, d, d);
     for (long m = stretch->begins[first]; m < stretch->begins[first + INNER]; m++)
@@ -691,9 +699,9 @@ static PyObject *solved(PyObject *const *args, Py_ssize_t count, int fills_in) {
     else if (read_equations(&door, args[0], &eq) && read_chain(&door, args[1], &eq, &chain)
              && (!fills_in || ((border = read_array(&door, args[2], "dw", "border")) != NULL
                                && (changes = read_array(&door, args[3], "DSd", "changes"))))) {
-        size_t size = (size_t)lay_out(&eq, &chain, NULL, NULL, &stretch);
-        memory = PyMem_Malloc(size * sizeof(double));
-        integers = PyMem_Malloc(size * sizeof(long));
+        Room room = lay_out(&eq, &chain, NULL, NULL, &stretch);
+        memory = PyMem_Malloc(room.numbers * sizeof(double));
+        integers = PyMem_Malloc(room.integers * sizeof(long));
         if (memory == NULL || integers == NULL)
             PyErr_NoMemory();
         else {

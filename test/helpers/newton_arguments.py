@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+from any_sizes import up_to
 import numpy as np
 from smoothing_problems import LANDMARKS, Problem
 from step_arguments import refusals
@@ -12,7 +13,7 @@ from step_arguments import refusals
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.geometry.sensor_mounting import Sensed
 from slam_observer_ros.smoothing import bordered_chain
-from slam_observer_ros.smoothing.bordered_chain import Equations, SMALL_BORDER
+from slam_observer_ros.smoothing.bordered_chain import Equations
 from slam_observer_ros.smoothing.gauss_newton import Smoother
 from slam_observer_ros.smoothing.observations import SensedPoints
 
@@ -70,9 +71,34 @@ def random_equations(S, landmarks):
     )
 
 
+def any_equations(rng):
+    """Return equations of any size: of poses with a drifting calibration and many sensors, too."""
+    k = int(rng.integers(2, 4))
+    d, c = (3, 6)[k - 2] + up_to(rng, 19) - 1, up_to(rng, 63) - 1
+    S, n, M = up_to(rng, 500), up_to(rng, 200), up_to(rng, 400)
+    poses, landmarks = np.divmod(np.sort(rng.permutation(S * n)[:M]), n)
+    M, b = len(poses), c + k * n
+
+    def linked(*shape):
+        return rng.normal(scale=0.1 / np.sqrt(d), size=shape)
+
+    return Equations(
+        diagonal=np.tile(10.0 * np.eye(d), (S, 1, 1)),
+        above=linked(S - 1, d, d),
+        shared=linked(S, d, c),
+        poses=poses,
+        landmarks=landmarks,
+        seen=linked(M, d, k),
+        first=linked(d, b),
+        corner=10.0 * (1.0 + S) * np.eye(b),
+        gradient=linked(S, d),
+        border_gradient=linked(b),
+    )
+
+
 def random_smoother(rng):
     """Return a smoother of points, of calibrated sensors or others, and where to linearise."""
-    axes, c = (PLANAR, SPATIAL)[rng.integers(2)], int(rng.integers(0, 5))
+    axes, c = (PLANAR, SPATIAL)[rng.integers(2)], up_to(rng, 63) - 1
     known = int(rng.integers(0, LANDMARKS + 1))
     problem = Problem(axes, c, int(rng.integers(2**31)), bool(rng.integers(2)), known)
     huber, gate = rng.choice([0.0, 1.345]), rng.choice([2.0, 1e9])
@@ -85,7 +111,7 @@ def random_smoother(rng):
 
 def random_sensed(rng, points, c):
     """Return points (M, 3) of two sensors, of which the last of c entries are estimated."""
-    M, count = len(points), int(rng.integers(0, c + 1))
+    M, count = len(points), int(rng.integers(0, min(c, 14) + 1))
     columns = np.full((2, 7), -1)
     places = rng.permutation(14)[:count]
     columns.flat[places] = np.arange(c - count, c)
@@ -110,8 +136,7 @@ def calls(compiled, rng):
     )
     smoother, start = random_smoother(rng)
     smoother._linearised_by(recorder, start, bool(rng.integers(2)))
-    S, landmarks = int(rng.integers(1, 42)), int(rng.choice([5, SMALL_BORDER]))
-    equations, _, _ = random_equations(S, landmarks)
+    equations = any_equations(rng)
     chain = bordered_chain._Compiled(recorder, equations)
     chain.fill_in(rng.standard_normal(len(chain.corner)))
     return taken

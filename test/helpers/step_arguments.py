@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from any_sizes import up_to
 import numpy as np
 
 from slam_observer_ros.geometry import se3
@@ -30,10 +31,10 @@ def random_covariance(rng, size, scale=0.1):
 def random_estimate(rng, n=None, of_tags=False):
     is_planar = bool(rng.integers(2))
     p, k = (3, 2) if is_planar else (6, 3)
-    velocity_entries = rng.permutation(42)[: rng.integers(1, 7)]
+    velocity_entries = rng.permutation(42)[: up_to(rng, 18)]
     estimated = np.append(velocity_entries, 42).astype(np.int64)
-    c = len(estimated) + int(rng.integers(0, 4))
-    n = int(rng.integers(1, 40)) if n is None else n
+    c = len(estimated) + up_to(rng, 60) - 1  # of up to eight sensors
+    n = up_to(rng, 200) if n is None else n
     first = p + c + int(rng.integers(0, 9)) * int(rng.integers(2))  # with what is postponed
     stride = k + of_tags * (p - k)
     size = first + stride * n
@@ -89,7 +90,7 @@ def random_observation(rng):
     """Return arguments of ``observe``."""
     x = random_estimate(rng, of_tags=rng.random() < 0.03)
     n, p, k = len(x.a), 3 if x.is_planar else 6, 2 if x.is_planar else 3
-    m = int(rng.integers(1, min(n, 8) + 1))
+    m = min(n, up_to(rng, 40))
     rows = rng.permutation(n)[:m]
     now_ns = START_NS
     last_ns = now_ns - rng.integers(0, 3, n) * SECOND_NS
@@ -101,7 +102,7 @@ def random_observation(rng):
     points[0, :2] += 20.0 * (rng.random() < 0.15)  # one that is rejected
     origins = 0.2 * rng.standard_normal((m, 3)) if rng.integers(2) else None
     c_v = len(x.estimated)
-    c_s = len(x.drift) - c_v
+    c_s = min(len(x.drift) - c_v, int(rng.integers(8)))
     is_calibrated = bool(rng.integers(2))
     seen = Seen(
         now_ns,

@@ -12,7 +12,6 @@ import sys
 import numpy as np
 import pytest
 from rounding import off_by
-import sanitized
 import step_arguments
 
 from slam_observer_ros.observer import core, step
@@ -85,6 +84,27 @@ def test_numpy_can_be_asked_for():
     assert run.stdout == f'None None numpy, as {core.VARIABLE} says\n'
 
 
-def test_sanitizers_find_nothing(tmp_path):
-    """Built to look for reads and writes out of bounds, and for undefined behaviour."""
-    assert sanitized.refused(SOURCE, 'step_arguments', tmp_path) >= 50
+def test_any_number_of_calibrated_sensors_is_used(compiled):
+    """Seven cameras with an estimated mount are 62 states, more than a fixed room once had."""
+    by_count = {}
+    for seed in range(60):
+        arguments = step_arguments.random_observation(np.random.default_rng(seed))
+        by_count[len(arguments[0].drift)] = compiled.observe(*arguments)
+    assert max(by_count) > 58
+    assert {status for count, status in by_count.items() if count > 58} & {step.DONE}
+
+
+def test_no_code_runs_between_a_check_and_its_use(compiled):
+    """A number's conversion could else change rows that were found to be in bounds."""
+    x, landmarks, seen, figures, *others = step_arguments.random_observation(
+        np.random.default_rng(3)
+    )
+
+    class Number:
+        def __float__(self):
+            seen.rows[:] = 2**40
+            return 1e-3
+
+    with pytest.raises(ValueError, match='PointFigures'):
+        compiled.observe(x, landmarks, seen, (Number(), *figures[1:]), *others)
+    assert (seen.rows < 2**40).all()
