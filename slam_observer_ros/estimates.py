@@ -17,6 +17,7 @@ UNUSED_POINTS = {
     'reserved_id': 'of a reserved id',
     'unweighed_point': 'more than can be weighed',
     'impossible_id': 'of an impossible id',
+    'bad_point': 'with NaN in what is stated of them',
     'unmapped_landmark': 'not mapped',
 }
 """Names under which observed points that are not used are counted, and what they are."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -186,12 +186,16 @@ class ObservationEvent:
             return []
         return [landmark_id for landmark_id, count in Counter(ids).items() if count > 1]
 
+    def of_points(self) -> dict[str, Any]:
+        """Return the arrays (m, …) of which each point has an entry, by name."""
+        stated = {name: getattr(self, name) for name in _OF_POINTS}
+        return {name: array for name, array in stated.items() if array is not None}
+
     def select(self, mask: BoolArray) -> ObservationEvent:
         """Return the points that ``mask`` (m,) picks."""
         if np.count_nonzero(mask) == len(mask):
             return self
-        stated = {name: getattr(self, name) for name in _OF_POINTS}
-        picked = {name: array[mask] for name, array in stated.items() if array is not None}
+        picked = {name: array[mask] for name, array in self.of_points().items()}
         sensed = None if self.sensed is None else self.sensed.select(mask)
         return replace(self, sensed=sensed, **picked)
 

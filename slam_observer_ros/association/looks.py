@@ -11,7 +11,12 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import (
+    mahalanobis,
+    solve_symmetric,
+    transpose,
+    with_blocks,
+)
 from slam_observer_ros.sensor_models.integration import integrate
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.state import State
@@ -151,7 +156,7 @@ class View:
             return False
         C, off = self.C[agree].reshape(-1, self.C.shape[-1]), self.off[agree].ravel()
         S = with_blocks(C @ self.motion_noise @ C.T, self.noise[agree])
-        return bool(off @ np.linalg.solve(S, off) - np.sum(slipped[agree] ** 2) > CLEAR**2)
+        return bool(off @ solve_symmetric(S, off) - np.sum(slipped[agree] ** 2) > CLEAR**2)
 
 
 def ids_of(looks: list[Look]) -> set[int]:

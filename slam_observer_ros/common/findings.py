@@ -402,6 +402,18 @@ KINDS = {
         'of them, to seconds and a gigabyte for 1000',
         'let the sensor or its driver send fewer, or use constant gains',
     ),
+    'bad_point': Kind(
+        Level.WARNING,
+        'not used: {count} points of an observation of which a covariance, velocity or '
+        'orientation is NaN or infinite; its other points are used',
+        'let the publisher give numbers; all zeros mean that a covariance is unknown',
+    ),
+    'vague_point': Kind(
+        Level.WARNING,
+        '{count} points are stated with a standard deviation beyond {limit_m:.0f} m in every '
+        'direction: they say nothing',
+        'state covariances in m², or zeros where they are unknown: then the settings apply',
+    ),
     'unweighed_point': Kind(
         Level.WARNING,
         '{count} points in one message, some of them or of the landmarks without an id: the '

@@ -31,7 +31,7 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import are_covariances, transpose
+from slam_observer_ros.geometry.matrices import are_covariances, MAX_DEVIATION, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
 from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.observer.gains import Gains
@@ -86,6 +86,27 @@ def check_event(event: Event, settings: Settings) -> None:
     else:
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
     _check_times(event.stamp_ns, event.receive_ns)
+
+
+def finite_points(event: ObservationEvent) -> ObservationEvent | None:
+    """Return an observation without points of which something is NaN or infinite; None if all.
+
+    A covariance that one tag misses says nothing against the other tags of the message.
+    """
+    fit, m = np.ones(len(event.ids), dtype=np.bool_), len(event.ids)
+    for array in event.of_points().values():
+        if not _is_plain(array) or len(array) != m or array.dtype.kind not in 'fiu':
+            return None
+        fit &= np.isfinite(array).reshape(m, -1).all(axis=1)
+    return event.select(fit) if fit.any() else None
+
+
+def are_vague(event: ObservationEvent) -> BoolArray:
+    """Return which points (m,) are stated to be anywhere within MAX_DEVIATION."""
+    if event.covariances is None:
+        return np.zeros(len(event.ids), dtype=np.bool_)
+    variances = np.diagonal(event.covariances, axis1=1, axis2=2)
+    return np.asarray(variances.min(axis=1) >= MAX_DEVIATION**2)
 
 
 def check_velocities(velocities: VelocityBlock, settings: Settings) -> None:
@@ -344,6 +365,9 @@ def usable_points(
         event = replace(event, orientations=used)
     if gains.observer.is_exact and event.velocities is not None:
         event = replace(event, velocities=None)  # its landmarks are at rest
+    if vague := np.count_nonzero(are_vague(event)):
+        counts['vague_point'] += vague
+        warnings.warn('vague_point', count=vague, limit_m=MAX_DEVIATION)
     ids = event.ids.tolist()
     are_usual = 0 < len(set(ids)) == len(ids) <= MAX_WEIGHED
     if are_usual and min(ids) >= 0 and max(ids) < FIRST_AUTOMATIC_ID:

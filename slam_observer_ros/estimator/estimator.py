@@ -18,6 +18,7 @@ from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.checks import (
     check_event,
     check_velocities,
+    finite_points,
     rigid,
     usable_maps,
     usable_points,
@@ -187,15 +188,27 @@ class Estimator(Estimate):
         """Take an event; return whether it was accepted.
 
         A bad event is dropped whole, counted in ``dropped`` by its reason and logged; the state
-        is untouched. The event's arrays are not copied: don't change them any more.
+        is untouched. Of an observation only the points of which something is NaN or infinite are
+        left out, if others remain (``'bad_point'`` in :attr:`counts`). The event's arrays are not
+        copied: don't change them any more.
         """
         try:
             check_event(event, self.settings)
             self._take(event)
         except InvalidEventError as error:
+            if error.reason == 'not_finite' and isinstance(event, ObservationEvent):
+                usable = finite_points(event)
+                if usable is not None:
+                    self._count_bad(len(event.ids) - len(usable.ids))
+                    return self.add(usable)
             self._drop(error)
             return False
         return True
+
+    def _count_bad(self, count: int) -> None:
+        self._warnings.warn('bad_point', count=count)
+        self._counts['observed_point'] += count
+        self._counts['bad_point'] += count
 
     def add_velocities(self, velocities: VelocityBlock) -> int:
         """Take velocities, each as :meth:`add` takes it; return how many were accepted.

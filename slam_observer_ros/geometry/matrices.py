@@ -32,6 +32,9 @@ LEAST_SHARE = 1e-4
 COVARIANCE_ROUNDING = 1e-6
 """By how much correlations may be off, or have a negative eigenvalue."""
 
+LOST = 1e-7
+"""Share of a variance below which a difference of two has lost half of its 16 digits."""
+
 
 def transpose(M: FloatArray) -> FloatArray:
     """Transpose each matrix of a stack (…, m, n)."""
@@ -86,11 +89,16 @@ def definite_inverse(S: FloatArray) -> FloatArray:
         L, is_indefinite = dpotrf(S, lower=1)
         if not is_indefinite:
             return inverse_by_factor(L)
-    return np.asarray(np.linalg.inv(S), dtype=np.float64)  # what rounding has made indefinite, too
+    try:
+        return np.asarray(np.linalg.inv(S), dtype=np.float64)  # rounding has made it indefinite
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.inv(definite(S)), dtype=np.float64)
 
 
 def inverse_by_factor(L: FloatArray) -> FloatArray:
     """Return (L Lᵀ)⁻¹ of a lower triangular L (q, q)."""
+    if not L.size:  # which LAPACK complains of, on the terminal
+        return L
     half, _ = dpotri(L, lower=1)
     whole: FloatArray = np.tril(half)
     whole += np.tril(whole, -1).T
@@ -132,6 +140,44 @@ def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
     half = K @ (0.5 * S @ K.T - CP)
     P += half + half.T
     return K
+
+
+def loses_digits(variances: FloatArray, W: FloatArray, L: FloatArray) -> bool:
+    """Return whether P − Wᵀ W has lost the digits that the rest of it is made of.
+
+    ``variances`` (N,) are those of P, W (M, N) is L⁻¹ H P, and L (M, M) the factor of S. P − Wᵀ W
+    leaves less than LOST of a variance, or a pivot of S less than LOST of the entry it began with.
+    """
+    left = variances - np.einsum('ij,ij->j', W, W)
+    if (left < LOST * variances).any():
+        return True
+    rows = np.tril(L)
+    return bool((L.diagonal() ** 2 < LOST * np.einsum('ij,ij->i', rows, rows)).any())
+
+
+def lifted(P: FloatArray, before: FloatArray) -> FloatArray:
+    """Return P (n, n), whose variances were ``before`` (n,), as far from singular as rounding.
+
+    What a correction has left is known no better than the rounding of what there was before. Of
+    its correlations :func:`definite` keeps all that it can.
+    """
+    least = len(P) * np.finfo(np.float64).eps
+    deviations = np.sqrt(np.maximum(P.diagonal(), np.maximum(least * before, _TINY)))
+    scales = deviations[:, None] * deviations
+    correlations = np.clip(symmetric(P) / scales, -1.0, 1.0)
+    np.fill_diagonal(correlations, 1.0)
+    return np.asarray(scales * definite(correlations))
+
+
+def mended(covariances: FloatArray) -> FloatArray:
+    """Return covariances (…, d, d) that rounding has left asymmetric, or negative somewhere."""
+    P = symmetric(covariances)
+    least = np.finfo(np.float64).eps * np.trace(P, axis1=-2, axis2=-1)[..., None, None]
+    with suppress(np.linalg.LinAlgError):  # nearly always, at a tenth of the cost
+        np.linalg.cholesky(P + np.maximum(least, _TINY) * np.eye(P.shape[-1]))
+        return P
+    variances, U = np.linalg.eigh(P)
+    return symmetric((U * np.maximum(variances, 0.0)[..., None, :]) @ transpose(U))
 
 
 def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks, part_of_joint, tags_among
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 
@@ -74,9 +75,12 @@ class LandmarkMap:
         return replace(self, world_points=self.world_points * np.array([1.0, 1.0, 0.0]))
 
     def covariances_or(self, sigma_m: float) -> FloatArray:
-        """Return (n, 3, 3) covariances, those of ``sigma_m`` in each coordinate if unknown."""
+        """Return (n, 3, 3) covariances, those of ``sigma_m`` in each coordinate if unknown.
+
+        Standard deviations beyond MAX_DEVIATION say no more than that, and are cut to it.
+        """
         if self.covariances is not None:
-            return self.covariances
+            return limited(self.covariances, np.full(3, MAX_DEVIATION))
         return np.tile(sigma_m**2 * np.eye(3), (len(self.ids), 1, 1))
 
     def landmarks_in(self, T: FloatArray, sigma_m: float) -> KnownLandmarks:
@@ -88,7 +92,8 @@ class LandmarkMap:
         if joint is not None:
             # A map's shape says nothing of a motion of everything: that is all but exact, and as
             # it concerns all landmarks information about it would drown all other in rounding.
-            joint = joint + RESOLUTION_M**2 * np.eye(len(joint))
+            joint = limited(joint, np.full(len(joint), MAX_DEVIATION))
+            joint += RESOLUTION_M**2 * np.eye(len(joint))
         return KnownLandmarks(
             self.world_points, covariances, joint, self.orientations, self.orientation_sigmas
         ).moved(T)

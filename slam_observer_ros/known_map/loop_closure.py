@@ -12,10 +12,9 @@ import logging
 import math
 
 import numpy as np
-from scipy.linalg import cholesky
 
 from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
-from slam_observer_ros.geometry.matrices import mahalanobis
+from slam_observer_ros.geometry.matrices import cholesky, mahalanobis
 from slam_observer_ros.known_map.merging import without_frame
 from slam_observer_ros.observer.landmark_table import MIN_LOOP
 from slam_observer_ros.state.state import State
@@ -228,7 +227,7 @@ def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArr
     # How the new ones lie to each other: where they are is not known.
     G = axes.output_matrix(points[new] - points[new].mean(axis=0)).reshape(-1, axes.p)
     of_new = P[p : p + m * k, p : p + m * k] + LEAST_M**2 * np.eye(m * k)
-    root = without_frame(cholesky(of_new, lower=True), G)
+    root = without_frame(cholesky(of_new), G)
     shape = root @ root.T + LEAST_M**2 * np.eye(m * k)
     seen = Constellation(points[new], shape, np.full(m, -1))
     error_probability = state.settings.localization_error_probability

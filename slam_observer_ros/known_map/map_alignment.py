@@ -10,6 +10,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.matrices import definite_inverse, solve_symmetric
 from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.known_landmarks import anchor, JITTER_M2, KnownLandmarks
@@ -113,9 +114,9 @@ def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float,
     Each is judged as in Baarda's data snooping, by what the others leave of it: Q r, with
     Q = S⁻¹ − S⁻¹ J (Jᵀ S⁻¹ J)⁻¹ Jᵀ S⁻¹, in units of its standard deviation.
     """
-    weights = np.linalg.inv(S + JITTER_M2 * np.eye(len(S)))
+    weights = definite_inverse(S + JITTER_M2 * np.eye(len(S)))
     W = weights @ J
-    Q = weights - W @ np.linalg.solve(J.T @ W, W.T)
+    Q = weights - W @ solve_symmetric(J.T @ W, W.T)
     left = Q @ r.ravel()
     variances = np.maximum(np.diagonal(Q), 1e-6 * np.diagonal(weights))
     return float(r.ravel() @ left), np.sum((left**2 / variances).reshape(r.shape), axis=1)

@@ -21,8 +21,10 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import (
+    cholesky,
     diagonal_blocks,
     mahalanobis,
+    solve_symmetric,
     transpose,
     turned,
     with_blocks,
@@ -179,7 +181,7 @@ class Near:
         off = np.concatenate([turn, transform[:3, 3] - self._pose[:3, 3]])[self._axes.pose]
         P = self._P + covariance
         log_det = float(np.linalg.slogdet(2.0 * math.pi * P)[1])
-        return -0.5 * (float(off @ np.linalg.solve(P, off)) + log_det)
+        return -0.5 * (float(off @ solve_symmetric(P, off)) + log_det)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +249,7 @@ class Weighing:
         pose, J = self._known.axes.pose, np.eye(6)
         J[3:, :3] = so3.hat(fit.centre - fit.transform[:3, 3])
         J = J[pose, pose]
-        return np.asarray(J @ np.linalg.solve(fit.information, J.T))
+        return np.asarray(J @ solve_symmetric(fit.information, J.T))
 
     def _fit(self, transform: FloatArray, rows: IntArray) -> _Fit | None:
         """Fit a place to its matches (m,); None if these are too few."""
@@ -291,15 +293,16 @@ class Weighing:
         axes, k = self._known.axes, self._known.axes.point
         placed = se3.transform(transform, part.points)
         S = with_blocks(turned(part.covariance, transform[:k, :k]), noise)
-        L = np.linalg.cholesky(S + 1e-12 * np.eye(len(S)))
+        L = cholesky(S + 1e-12 * np.eye(len(S)))
         centre = placed.mean(axis=0)
         J = axes.output_matrix(placed - centre).reshape(-1, axes.p)
-        J, r = np.linalg.solve(L, J), np.linalg.solve(L, (placed - there)[:, :k].ravel())
+        J = np.asarray(np.linalg.solve(L, J), dtype=np.float64)
+        r = np.linalg.solve(L, (placed - there)[:, :k].ravel())
         information = J.T @ J
         sign, log_det = np.linalg.slogdet(information)
         if sign <= 0 or log_det < -2.0 * axes.p:
             return None
-        step = -np.linalg.solve(information, J.T @ r)
+        step = -solve_symmetric(information, J.T @ r)
         left, dof = r + J @ step, len(r) - axes.p
         # The variances may be larger than stated: as these say, within limits.
         factor = min(max(float(left @ left) / max(dof, 1), 1.0), MAX_VARIANCE_FACTOR)
@@ -315,7 +318,7 @@ class Weighing:
         k, R = axes.point, fit.transform[: axes.point, : axes.point]
         placed = se3.transform(fit.transform, seen.points)
         J = axes.output_matrix(placed - fit.centre)
-        of_place = J @ np.linalg.solve(fit.information, transpose(J))
+        of_place = J @ solve_symmetric(fit.information, transpose(J))
         covariances = R @ self._own @ R.T + known.largest_covariance + of_place
         rivals = min(RIVALS, len(known))
         _, near = known.tree.query(placed[:, :k], k=rivals)

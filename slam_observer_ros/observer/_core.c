@@ -25,6 +25,7 @@ static const double RELATIVE_RESOLUTION = 1e-6;
 static const double MAX_ERROR_M = 1e3;
 static const double MIN_SHARE = 1e-6;
 static const double MIN_INTERVAL_S = 1e-3;
+static const double LOST = 1e-7;             /* matrices.py */
 static const double SUSPICION = 3.0;         /* robust.py */
 static const double LOG_ROOT_2_PI = 0.9189385332046728;
 static const int REWEIGHTINGS = 2;
@@ -690,9 +691,11 @@ static void add_to_diagonal(double C[9], double variance) {
 
 /* The covariance of a point along a line of sight by its figures: along, and across. */
 static void point_covariance(const double line[3], const PointFigures *figures, double C[9]) {
-    double square = dot3(line, line);
+    double square = dot3(line, line), most = MAX_ERROR_M * MAX_ERROR_M;
     double along = figures->along_0 + (figures->along_2 + figures->along_4 * square) * square;
-    double across = square > 0.0 ? figures->across_0 + figures->across_2 * square : along;
+    along = along < most ? along : most;
+    double across = figures->across_0 + figures->across_2 * square;
+    across = square > 0.0 ? (across < most ? across : most) : along;
     double excess = (along - across) / larger(square, TINY);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
@@ -1116,7 +1119,26 @@ static int fill_weights(double huber, Residuals *res, double *work) {
     return 1;
 }
 
-/* (30), (31)  dx = -K r, K = P H' S^-1, and P - K H P; 0 if S is indefinite.
+/* Whether S = L L' has a pivot that is next to nothing of the entry it began with, or P - W' W a
+ * variance, but for the postponed ones: then the rest has no digits. */
+static int loses_digits(const Estimate *x, const Residuals *res, const double *L) {
+    for (long i = 0; i < res->M; i++) {
+        const double *row = L + i * res->M;
+        double pivot = row[i] * row[i];
+        if (pivot < LOST * (pivot + sum_of_squares(row, i)))
+            return 1;
+    }
+    for (long j = 0; j < x->N; j++) {
+        double before = x->P[j * x->room + j], left = before;
+        for (long i = 0; i < res->M; i++)
+            left -= res->W[i * x->N + j] * res->W[i * x->N + j];
+        if (left < LOST * before && (j < x->p + x->c || j >= x->first))
+            return 1;
+    }
+    return 0;
+}
+
+/* (30), (31)  dx = -K r, K = P H' S^-1, and P - K H P; 0 if S is indefinite, or digits are lost.
  * H takes C at the landmark itself: so no observation says anything of the gauge. */
 static int correct(const Estimate *x, Residuals *res, double *L) {
     long M = res->M, N = x->N, c = res->has_sensor ? x->c : 0;
@@ -1150,6 +1172,8 @@ static int correct(const Estimate *x, Residuals *res, double *L) {
     memcpy(z, res->r, (size_t)M * sizeof(double));
     solve_lower(L, M, z);
     solve_lower_rows(L, M, res->W, N, N);
+    if (loses_digits(x, res, L))
+        return 0;
     memset(res->dx, 0, (size_t)N * sizeof(double));
     for (long i = 0; i < M; i++)
         for (long j = 0; j < N; j++)

@@ -18,6 +18,9 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     kalman_update,
+    lifted,
+    loses_digits,
+    mended,
     transpose,
     with_blocks,
 )
@@ -111,7 +114,7 @@ class JointCovariance:
             joint._drift_on(n, ahead_s)
         _, own = joint.output(self._turning(points), np.arange(n))
         covariances = np.zeros((n, 3, 3))
-        covariances[:, :k, :k] = own
+        covariances[:, :k, :k] = mended(own)
         return covariances
 
     def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray | None:
@@ -245,16 +248,31 @@ class JointCovariance:
         """
         if not len(r):
             return np.zeros(len(self.P))
+        errors = self._errors
+        before = self.P.diagonal()[errors]
         L, is_indefinite = dpotrf(S, lower=1)
         if is_indefinite:  # by rounding, where all but nothing was known
             moved: FloatArray = kalman_update(self.P, HP, S).dot(r)
+            self._lift(errors, before)
             return moved
         # P − Wᵀ W and Wᵀ z, W = L⁻¹ H P, z = L⁻¹ r, L Lᵀ = S.
         z = dtrsv(L, r, lower=1)
         W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
         self._matrix.subtract_square(W)
+        if loses_digits(before, W[:, errors], L):
+            self._lift(errors, before)
         Kr: FloatArray = z.dot(W)
         return Kr
+
+    @property
+    def _errors(self) -> IntArray:
+        """Columns of P that are entries of x, not of what is postponed."""
+        return np.append(np.arange(self.chart.robot), np.arange(self.first, len(self.P)))
+
+    def _lift(self, errors: IntArray, before: FloatArray) -> None:
+        """Make P a covariance again after a correction of which rounding has left too little."""
+        at = np.ix_(errors, errors)
+        self.P[at] = lifted(self.P[at], before)
 
     # Landmarks
 

@@ -18,7 +18,13 @@ from scipy.linalg import cho_factor, cho_solve
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import block_diagonal, definite, symmetric, turned
+from slam_observer_ros.geometry.matrices import (
+    block_diagonal,
+    cholesky,
+    solve_symmetric,
+    symmetric,
+    turned,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,11 +127,11 @@ def anchor(
     S = S + JITTER_M2 * np.eye(len(r))
     # γ by generalised least squares, then a Kalman filter's gain for the rest.
     information = gauge_information(J, S)
-    gamma = np.linalg.solve(information, J.T @ _solve(S, r))
+    gamma = solve_symmetric(information, J.T @ _solve(S, r))
     K = _solve(S, PH.T).T
     # The error of γ adds to what remains of P.
     B = G - K @ J
-    after = P - K @ PH.T + B @ np.linalg.solve(information, B.T)
+    after = P - K @ PH.T + B @ solve_symmetric(information, B.T)
     return G @ gamma + K @ (r - J @ gamma), symmetric(after)
 
 
@@ -133,5 +139,5 @@ def _solve(S: FloatArray, right: FloatArray) -> FloatArray:
     try:
         factor = cho_factor(S)
     except np.linalg.LinAlgError:
-        factor = cho_factor(definite(S))
+        factor = cholesky(symmetric(S)), True
     return np.asarray(cho_solve(factor, right), dtype=np.float64)

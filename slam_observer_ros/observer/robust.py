@@ -14,9 +14,11 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry.matrices import (
+    definite_inverse,
     diagonal_blocks,
     mahalanobis,
     solve_definite,
+    solve_symmetric,
     with_blocks,
 )
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -78,11 +80,11 @@ def far_from_the_others(
     """Return which observations (m,) pass the gate, but are far off if all others are true."""
     passed, predicted_passed = gated(r, predicted, noise, gate)
     S = with_blocks(predicted_passed, noise[passed])
-    information: FloatArray = np.linalg.inv(S).astype(np.float64)
+    information = definite_inverse(S)
     S_inv_r = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
     blocks = diagonal_blocks(information, r.shape[1])
     # The rest of the residual r_i, after all others: ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i.
-    left = np.asarray(np.linalg.solve(blocks, S_inv_r)[:, :, 0])
+    left = solve_symmetric(blocks, S_inv_r)[:, :, 0]
     passed[passed] = are_far(mahalanobis(left, noise[passed]), gate)
     return passed
 

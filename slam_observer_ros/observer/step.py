@@ -21,7 +21,12 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
-from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, with_blocks
+from slam_observer_ros.geometry.matrices import (
+    diagonal_blocks,
+    loses_digits,
+    mahalanobis,
+    with_blocks,
+)
 from slam_observer_ros.geometry.sensor_mounting import sensitivity as sensor_sensitivity
 from slam_observer_ros.observer.arrays import (
     add_symmetric_product,
@@ -464,7 +469,8 @@ def _weights(residuals: _Residuals, judged: _Judged, limits: Limits) -> FloatArr
 def _correct(x: Estimate, residuals: _Residuals, weights: FloatArray) -> FloatArray | None:
     """Return −K r, K = P Hᵀ S⁻¹ (30), (31), and let P become P − K H P; None if S is indefinite.
 
-    H takes C at ŷ_i: so no observation says anything of the gauge.
+    Or if digits are lost, see :func:`loses_digits`. H takes C at ŷ_i: so no observation says
+    anything of the gauge.
     """
     C, P, columns = residuals.output_matrix(0.0), x.P, residuals.columns
     q = C.shape[1]
@@ -476,6 +482,9 @@ def _correct(x: Estimate, residuals: _Residuals, weights: FloatArray) -> FloatAr
         return None
     # W = L⁻¹ H P:  P − Wᵀ W,  K r = Wᵀ L⁻¹ r
     W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+    errors = np.append(np.arange(residuals.axes.p + len(x.drift)), np.arange(x.first, x.size))
+    if loses_digits(P.diagonal()[errors], W[:, errors], L):
+        return None
     subtract_square(P, x.size, W)
     dx: FloatArray = -dtrsv(L, residuals.flat, lower=1).dot(W[:, : x.size])
     return dx

@@ -23,6 +23,7 @@ from slam_observer_ros.estimates import (
     UNUSED_POINTS,
     Update,
 )
+from slam_observer_ros.geometry.matrices import MAX_DEVIATION
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 MAX_REJECTED = 0.1
@@ -34,6 +35,9 @@ MAX_REJECTED_ORIENTATIONS = 0.5
 MAX_UNMAPPED = 0.5
 """Share of the points beyond which they are more than what a map has not got yet."""
 
+MAX_VAGUE = 0.5
+"""Share of the points, stated to be anywhere, beyond which they are what the sensor states."""
+
 LEFT_OUT = (
     'rejected_landmark',
     'unknown_id',
@@ -41,6 +45,7 @@ LEFT_OUT = (
     'reserved_id',
     'impossible_id',
     'unweighed_point',
+    'bad_point',
 )
 """Points not used for something that is wrong, as one that a known map has not may be right."""
 
@@ -252,7 +257,7 @@ def of_fit(factor: float | None) -> list[Finding]:
 
 
 def of_rejections(counts: Counter[str], when: str = '') -> list[Finding]:
-    """Judge whether more points or orientations were rejected than are outliers."""
+    """Judge whether more points or orientations were rejected than are outliers, or say little."""
     points, orientations = (
         point_share(counts, f'rejected_{what}') for what in ('landmark', 'orientation')
     )
@@ -261,6 +266,9 @@ def of_rejections(counts: Counter[str], when: str = '') -> list[Finding]:
         found_so.append(found('rejected_points', percent=100.0 * points, when=when))
     if orientations > MAX_REJECTED_ORIENTATIONS:
         found_so.append(found('rejected_orientations', percent=100.0 * orientations, when=when))
+    if point_share(counts, 'vague_point') > MAX_VAGUE:
+        count = counts['vague_point']
+        found_so.append(found('vague_point', count=count, limit_m=MAX_DEVIATION))
     return found_so
 
 

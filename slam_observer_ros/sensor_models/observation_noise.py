@@ -156,9 +156,10 @@ def point_covariances(lines_of_sight: FloatArray, figures: PointFigures) -> Floa
 
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """
-    squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)
+    squared, most = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight), MAX_ERROR_M**2
     along = figures.along_0 + (figures.along_2 + figures.along_4 * squared) * squared
-    across = figures.across_0 + figures.across_2 * squared
+    along = np.minimum(along, most)
+    across = np.minimum(figures.across_0 + figures.across_2 * squared, most)
     if np.count_nonzero(squared) < len(squared):
         across = np.where(squared > 0.0, across, along)
     excess = (along - across) / np.maximum(squared, _TINY)

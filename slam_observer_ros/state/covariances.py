@@ -18,7 +18,7 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import limited, transpose
+from slam_observer_ros.geometry.matrices import limited, mended, transpose
 from slam_observer_ros.observer.observer import Observer
 
 MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
@@ -45,8 +45,7 @@ def of_configuration(
     seen_covariance = turned_moment(seen_covariance, CP[:, turns], P[turns, turns])
     blocks = seen_covariance.reshape(m, k, m, k).swapaxes(1, 2)
     R = observer.A[:k, :k]
-    seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
-    return seen
+    return mended((R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k))
 
 
 def of_pose(observer: Observer, covariance: FloatArray, A: FloatArray) -> FloatArray:
@@ -55,8 +54,7 @@ def of_pose(observer: Observer, covariance: FloatArray, A: FloatArray) -> FloatA
     Of its rotation vector and its position along the world's axes, rad² and m².
     """
     turn = _turn_to_world(observer, A)
-    world: FloatArray = turn @ covariance @ transpose(turn)
-    return world
+    return mended(turn @ covariance @ transpose(turn))
 
 
 def of_pose_error(observer: Observer, world: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import diagonal_blocks
+from slam_observer_ros.geometry.matrices import are_covariances, diagonal_blocks
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import Parameter, table, Value
@@ -103,6 +103,7 @@ class AnyRun:
         for array in (covariance, estimator.landmark_covariances):
             if array is not None:
                 assert np.isfinite(array).all()
+                assert are_covariances(array).all()
         assert np.isfinite(estimator.world_points).all()
         assert np.isfinite(estimator.body_velocity).all()
         assert np.isfinite(estimator.lyapunov)
