@@ -27,8 +27,11 @@ def test_the_robot_is_localised_before_and_after_what_happens_half_way(
     monkeypatch, capsys, options
 ):
     monkeypatch.chdir(CHECKOUT)
-    exit_code = robot.main(['--duration', '14', '--real-time-factor', '1', *options])
-    output = capsys.readouterr().out
+    for factor in ('1', '0.5', '0.25'):
+        exit_code = robot.main(['--duration', '14', '--real-time-factor', factor, *options])
+        output = capsys.readouterr().out
+        if 'too slow' not in output:  # else what it says is done: other tests run beside this one
+            break
     assert exit_code == 0, output
     assert 'The robot was localised.' in output
 
