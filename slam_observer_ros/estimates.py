@@ -15,7 +15,7 @@ UNUSED_POINTS = {
     'unknown_id': 'without id',
     'repeated_id': 'of a repeated id',
     'reserved_id': 'of a reserved id',
-    'unweighed_point': 'more than can be weighed',
+    'surplus_point': 'more than max_points',
     'impossible_id': 'of an impossible id',
     'bad_point': 'with NaN in what is stated of them',
     'unmapped_landmark': 'not mapped',

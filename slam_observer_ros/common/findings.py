@@ -396,12 +396,6 @@ KINDS = {
         'points without an id are not used by {gains} gains',
         'only riccati gains use them',
     ),
-    'many_points': Kind(
-        Level.WARNING,
-        'an observation has {count} points: the time that riccati gains take grows with the cube '
-        'of them, to seconds and a gigabyte for 1000',
-        'let the sensor or its driver send fewer, or use constant gains',
-    ),
     'bad_point': Kind(
         Level.WARNING,
         'not used: {count} points of an observation of which a covariance, velocity or '
@@ -414,11 +408,12 @@ KINDS = {
         'direction: they say nothing',
         'state covariances in m², or zeros where they are unknown: then the settings apply',
     ),
-    'unweighed_point': Kind(
+    'surplus_point': Kind(
         Level.WARNING,
-        '{count} points in one message, some of them or of the landmarks without an id: the '
-        '{most} with an id or nearest are used',
-        'give ids, or send fewer points',
+        'an observation of {frame} has {count} points, more than are used in time: of those of '
+        'known landmarks, then the nearest in each direction, {most} are',
+        'see whether these are landmarks, and not the points of a lidar or depth camera; let the '
+        'sensor or its driver send fewer, or set max_points higher, or constant gains',
     ),
     'full_map': Kind(
         Level.WARNING,

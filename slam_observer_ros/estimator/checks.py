@@ -50,11 +50,8 @@ MAX_MEASURED = 1e6
 NEARLY = 1.0 - 1e-9
 """Share of a limit below which a value is below the limit, however it is rounded."""
 
-MAX_WEIGHED = 100
-"""Points of one observation that are weighed against landmarks without ids, at most.
-
-It takes the cube of them, and memory the square: a second and 100 MB by then.
-"""
+SECTORS = 12
+"""Directions about the vertical axis in each of which the nearest points are used first."""
 
 _INTEGERS = (int, np.int64)
 _FLOAT64 = np.dtype(np.float64)
@@ -369,7 +366,7 @@ def usable_points(
         counts['vague_point'] += vague
         warnings.warn('vague_point', count=vague, limit_m=MAX_DEVIATION)
     ids = event.ids.tolist()
-    are_usual = 0 < len(set(ids)) == len(ids) <= MAX_WEIGHED
+    are_usual = 0 < len(set(ids)) == len(ids) <= settings.max_points
     if are_usual and min(ids) >= 0 and max(ids) < FIRST_AUTOMATIC_ID:
         return event
     if (impossible := event.ids == IMPOSSIBLE_ID).any():
@@ -393,21 +390,31 @@ def usable_points(
         warnings.warn('unknown_id', gains=settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)
-    elif can_weigh and len(event.ids) > MAX_WEIGHED:
-        warnings.many_points(len(event.ids))
-        if unknown.any() or is_automatic(landmarks.ids).any():
-            counts['unweighed_point'] += len(event.ids) - MAX_WEIGHED
-            warnings.warn('unweighed_point', count=len(event.ids), most=MAX_WEIGHED)
-            event = event.select(_first_weighed(event, unknown))
+    elif can_weigh and len(event.ids) > settings.max_points:
+        count, most = len(event.ids), settings.max_points
+        warnings.warn('surplus_point', count=count, frame=event.sensor_frame or 'it', most=most)
+        counts['surplus_point'] += count - most
+        event = event.select(_most_useful(event, landmarks.ids, most))
     return event
 
 
-def _first_weighed(event: ObservationEvent, unknown: BoolArray) -> BoolArray:
-    """Return which points (m,) are weighed, where not all can be: with ids first, and the nearest.
+def _most_useful(event: ObservationEvent, known_ids: IntArray, most: int) -> BoolArray:
+    """Return which points (m,) are used, where there are more than can be in time.
 
-    The nearest are measured best, and are the same in the next observation.
+    Known landmarks first, as they say where the robot is, then points without an id, which may be
+    some, then new ones. Of each kind the nearest in each direction: directions that differ say
+    more, and the nearest are measured best, and are the same in the next observation.
     """
-    order = np.lexsort((np.linalg.norm(event.lines_of_sight, axis=1), unknown))
-    weighed = np.zeros(len(order), dtype=np.bool_)
-    weighed[order[:MAX_WEIGHED]] = True
-    return weighed
+    kind = np.where(event.ids == UNKNOWN_ID, 1, 2)
+    kind[np.isin(event.ids, known_ids)] = 0
+    lines = event.lines_of_sight
+    ranges_m = np.linalg.norm(lines, axis=1)
+    sector = np.floor(SECTORS * (np.arctan2(lines[:, 1], lines[:, 0]) / (2.0 * np.pi) + 0.5))
+    order = np.lexsort((ranges_m, sector, kind))
+    group = SECTORS * kind[order] + np.minimum(sector[order], SECTORS - 1)
+    # How many of its kind and sector are nearer.
+    place = np.arange(len(order)) - np.searchsorted(group, group)
+    order = order[np.lexsort((ranges_m[order], place, kind[order]))]
+    useful = np.zeros(len(order), dtype=np.bool_)
+    useful[order[:most]] = True
+    return useful

@@ -50,7 +50,7 @@ class Estimate:
         ``'carried_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
         ``'unsupported_landmark'``, ``'merged_landmark'``, ``'doubled_landmark'``) and points not
         used (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
-        ``'unweighed_point'``, ``'bad_point'``). ``'vague_point'`` counts points that are used,
+        ``'surplus_point'``, ``'bad_point'``). ``'vague_point'`` counts points that are used,
         but whose stated covariance says nothing.
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts

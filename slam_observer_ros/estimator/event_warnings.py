@@ -21,9 +21,6 @@ MAX_NAMED = 10
 MANY_LANDMARKS = 300
 """Landmarks of a dense covariance from which on a step takes 20 ms and more."""
 
-MANY_POINTS = 300
-"""Points in one observation from which on these gains take a tenth of a second and more."""
-
 MANY_MOVED = 5
 """Landmarks that seem to have moved lately from which on the odometry may be at fault."""
 
@@ -48,11 +45,6 @@ class EventWarnings:
         count = self._counts[counted_as or kind]
         if str(count).rstrip('0') == '1':
             logger.warning('%s', found(kind, **figures).text(f' ({count} so far)'))
-
-    def many_points(self, count: int) -> None:
-        """Say once that one observation has so many points that riccati gains take long."""
-        if count >= MANY_POINTS:
-            self._warn_once('many_points', count=count)
 
     def large_map(self, count: int, limit: int, gains: Gains) -> None:
         """Say once that a map is full, with 0 < ``limit``, and that its ``gains`` take long."""

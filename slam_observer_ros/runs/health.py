@@ -44,7 +44,7 @@ LEFT_OUT = (
     'repeated_id',
     'reserved_id',
     'impossible_id',
-    'unweighed_point',
+    'surplus_point',
     'bad_point',
 )
 """Points not used for something that is wrong, as one that a known map has not may be right."""

@@ -423,6 +423,13 @@ class Settings:
         minimum=0,
         maximum=1_000_000,
     )
+    max_points: int = parameter(
+        100,
+        'Riccati gains: most points of one observation that are used, those of known landmarks '
+        'first, then the nearest in each direction; time grows with the cube of their number',
+        minimum=1,
+        maximum=1_000_000,
+    )
     min_support: int = parameter(
         5,
         'Riccati gains, points without id: how often a landmark must be seen to be in the map; it '

@@ -11,10 +11,10 @@ import pytest
 from strategies import generators
 
 from slam_observer_ros.common.errors import MapError, ParameterError
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import used_points
-from slam_observer_ros.estimator.checks import MAX_WEIGHED
+from slam_observer_ros.estimator.checks import SECTORS
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.estimator.event_warnings import MANY_POINTS
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityBlock, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import are_covariances
@@ -183,34 +183,70 @@ def cloud(m, ids, stamp_ns=0):
     return ObservationEvent(stamp_ns, ids, points)
 
 
-def test_of_a_large_cloud_without_ids_those_nearest_are_weighed_and_the_others_counted(caplog):
+MOST = Settings().max_points
+
+
+def test_of_a_large_cloud_the_nearest_in_each_direction_are_used_and_the_others_counted(caplog):
     estimator, m = Estimator(Settings(reorder_window=0.0)), 1000
-    ids = np.full(m, UNKNOWN_ID)
-    ids[-3:] = [1, 2, 3]  # which are used wherever they are
     for k in range(2):
-        assert estimator.add(cloud(m, ids, k * 10**8))
-    known = estimator._state.landmarks.ids
-    assert len(known) == MAX_WEIGHED
-    assert set(known[known < 10]) == {1, 2, 3}
-    own = np.linalg.norm(estimator._state.observer.world_points[known > 10], axis=1)
-    all_of_them = np.linalg.norm(cloud(m, ids).points[:-3], axis=1)
-    np.testing.assert_allclose(np.sort(own), np.sort(all_of_them)[: len(own)], atol=1e-6)
-    assert estimator.counts['unweighed_point'] == 2 * (m - MAX_WEIGHED)
-    assert used_points(estimator.counts) == 2 * MAX_WEIGHED
-    assert '1000 points in one message' in caplog.text
-    # With ids alone no point is weighed against others, unless landmarks have none.
-    estimator.add(cloud(m, np.arange(m), 2 * 10**8))
-    assert estimator.counts['unweighed_point'] == 3 * (m - MAX_WEIGHED)
+        assert estimator.add(cloud(m, np.full(m, UNKNOWN_ID), k * 10**8))
+    used = estimator._state.observer.world_points
+    assert len(used) == MOST
+    sectors, counts = np.unique(sector(used), return_counts=True)
+    assert len(sectors) == SECTORS
+    assert counts.max() - counts.min() <= 1
+    every = cloud(m, np.arange(m)).points
+    for number in sectors:
+        nearest = np.sort(np.linalg.norm(every[sector(every) == number], axis=1))
+        ranges_m = np.sort(np.linalg.norm(used[sector(used) == number], axis=1))
+        np.testing.assert_allclose(ranges_m, nearest[: len(ranges_m)], atol=1e-6)
+    assert estimator.counts['surplus_point'] == 2 * (m - MOST)
+    assert used_points(estimator.counts) == 2 * MOST
+    assert '1000 points' in caplog.text
+    assert 'lidar' in caplog.text
 
 
-@pytest.mark.parametrize('gains', ['constant', 'riccati'])
-def test_of_points_with_ids_all_are_used_and_it_is_said_where_that_takes_long(caplog, gains):
-    m = MANY_POINTS + 1
-    estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
-    estimator.add(cloud(m, np.arange(m)))
-    assert len(estimator._state.landmarks) == m
-    assert estimator.counts['unweighed_point'] == 0
-    assert (f'An observation has {m} points' in caplog.text) == (gains == 'riccati')
+def sector(points):
+    turns = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi)
+    return np.floor(SECTORS * (turns + 0.5))
+
+
+def test_of_a_large_cloud_known_landmarks_are_used_first_then_points_without_id():
+    estimator, m = Estimator(Settings(reorder_window=0.0)), 400
+    known = np.arange(30) * 7
+    estimator.add(cloud(m, np.arange(m)).select(np.isin(np.arange(m), known)))
+    ids = np.arange(m)
+    ids[300:320] = UNKNOWN_ID
+    estimator.add(cloud(m, ids, 10**8))
+    seen = estimator._state.landmarks
+    assert len(seen) == 30 + (MOST - 30)
+    assert (seen.counts[np.isin(seen.ids, known)] == 2).all()
+    assert np.count_nonzero(seen.ids >= FIRST_AUTOMATIC_ID) == 20
+
+
+def test_max_points_says_how_many_and_constant_gains_use_all():
+    m = 250
+    for settings, used in (
+        (Settings(gains='constant'), m),
+        (Settings(max_points=m), m),
+        (Settings(max_points=7), 7),
+    ):
+        estimator = Estimator(replace(settings, reorder_window=0.0))
+        estimator.add(cloud(m, np.arange(m)))
+        assert len(estimator._state.landmarks) == used
+        assert estimator.counts['surplus_point'] == m - used
+
+
+def test_a_flood_of_points_leaves_no_more_landmarks_active_than_are_needed():
+    settings = Settings(reorder_window=0.0, max_points=500, relinearization_interval=0)
+    estimator, m = Estimator(settings), 300
+    few = np.arange(m) < 10
+    for k in range(200):
+        event = cloud(m, np.arange(m), k * 10**8)
+        estimator.add(event if k < 3 else event.select(few))
+        if k == 3:
+            assert len(estimator._state.known_errors.joint.active) == m
+    assert len(estimator._state.known_errors.joint.active) <= 2 * (10 + 30)
 
 
 def test_an_estimate_that_settings_lead_out_of_all_bounds_starts_again_and_says_so(caplog):

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 CHECK_INTERVAL = 20
 """Observations in which each landmark is compared with its reference once."""
 
+SHRINK_INTERVAL = 50
+"""Observations after which a flood of points is over, if none of them needed half as many."""
+
 
 @dataclass(frozen=True, slots=True)
 class BlockSize:
@@ -53,6 +56,7 @@ class ActiveLandmarks(JointCovariance):
         self._set_active(np.arange(n), n)
         self._following = FollowingLandmarks(self.chart, observer)
         self._checks, self._has_moved, self._most = 0, False, size.most
+        self._looks, self._needed = 0, size.most
         observer.postponed = self
 
     def copy(self, observer: FilterArrays) -> Self:
@@ -103,12 +107,22 @@ class ActiveLandmarks(JointCovariance):
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks ``rows`` (m,), of an observation, are active."""
+        self._shrink(len(rows))
         missing = rows[self._places[rows] < 0]
         if len(missing) or len(self.active) > self._most:
             self._switch(self._chosen(rows))
         elif self._has_moved:
             self._check_references()
         self._has_moved = False  # once is enough, however often an observation is looked at
+
+    def _shrink(self, seen: int) -> None:
+        """Let fewer be active once observations of so many points have not come for a while."""
+        kept = max(self._size.kept, self._size.kept_per_seen * seen)
+        self._looks, self._needed = self._looks + 1, max(self._needed, 2 * (seen + kept))
+        if self._looks % SHRINK_INTERVAL == 0:
+            if self._most > 2 * self._needed:
+                self._most = self._needed
+            self._needed = self._size.most
 
     def _check_references(self) -> None:
         """Let references be present estimates, if some of the next panels are far from theirs."""
