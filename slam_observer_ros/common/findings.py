@@ -410,8 +410,8 @@ KINDS = {
     ),
     'surplus_point': Kind(
         Level.WARNING,
-        'an observation of {frame} has {count} points, more than are used in time: of those of '
-        'known landmarks, then the nearest in each direction, {most} are',
+        'an observation of {source} has {count} points, more than are used in time: {most} are, '
+        'known landmarks first, then the nearest in each direction',
         'see whether these are landmarks, and not the points of a lidar or depth camera; let the '
         'sensor or its driver send fewer, or set max_points higher, or constant gains',
     ),

@@ -392,7 +392,8 @@ def usable_points(
         event = event.select(~unknown)
     elif can_weigh and len(event.ids) > settings.max_points:
         count, most = len(event.ids), settings.max_points
-        warnings.warn('surplus_point', count=count, frame=event.sensor_frame or 'it', most=most)
+        source = event.sensor_frame or 'a sensor'
+        warnings.warn('surplus_point', source=source, count=count, most=most)
         counts['surplus_point'] += count - most
         event = event.select(_most_useful(event, landmarks.ids, most))
     return event

@@ -239,6 +239,8 @@ class ObserverCore:
     def start(self) -> None:
         """Begin to use what comes in and to publish; a new core waits for this."""
         self._flow.feed.is_active = True
+        for source in self._flow.inputs:
+            source.begin_looking()
         for timer in self._timers:
             timer.reset()
 

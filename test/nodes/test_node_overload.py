@@ -29,7 +29,7 @@ V = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])
 NONE_IS_LOST = {'twist_qos': 'reliable', 'queue_depth': 1000}
 """A busy machine may hold up the node for longer than its queue lasts by default, a second."""
 
-DEFAULT = {'landmarks_max_wait': ObserverNodeSettings.landmarks_max_wait}
+DEFAULT = {'landmarks_max_wait': ObserverNodeSettings.landmarks_max_wait, 'max_points': 1000}
 
 
 def seen_by(frame_id):

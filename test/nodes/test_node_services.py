@@ -423,13 +423,15 @@ def test_an_input_is_judged_by_what_came_since_the_last_time(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr(node_diagnostics.time, 'monotonic', lambda: now_s[0])
     source = SimpleNamespace(
-        name='twist', topic='/twist', received=0, age_s=None, malformed=0, problem='', doubt=None,
+        name='twist', topic='/twist', received=0, age_s=None, silent_s=0.0, malformed=0,
+        problem='', doubt=None,
         backlog=SimpleNamespace(wait_s=0.0), shedding=SimpleNamespace(shed=0),
         last_malformed=found('malformed_message', topic="'/twist'", error='too short'),
     )  # fmt: skip
     publishing, messages, rates = Publishing(source), [], []
     for received, malformed, age_s in [(0, 0, None), (40, 2, 0.1), (60, 2, 0.1), (60, 2, 3.0)]:
         source.received, source.malformed, source.age_s = received, malformed, age_s
+        source.silent_s = age_s or 0.0
         now_s[0] += 2.0
         status = publishing.publish(velocity=1)
         assert status.level != DiagnosticStatus.ERROR
@@ -447,7 +449,7 @@ def test_an_input_of_which_nothing_was_ever_used_is_an_error():
     """As landmarks in a frame that /tf does not have, beside good odometry."""
     source = SimpleNamespace(
         name='landmarks', topic='/tags', received=MANY_UNUSED, age_s=0.1, malformed=0, problem='',
-        doubt=None,
+        doubt=None, silent_s=0.1,
         backlog=SimpleNamespace(wait_s=0.0), shedding=SimpleNamespace(shed=0),
         last_malformed=found('malformed_message', topic="'/twist'", error='too short'),
     )  # fmt: skip

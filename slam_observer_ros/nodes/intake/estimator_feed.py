@@ -168,6 +168,11 @@ class EstimatorFeed:
         if self.is_active and problem:
             self._drop('scan', problem)
         else:
+            count, most = len(measured.ids), self._estimator.settings.max_points
+            if count > most:
+                topic = self._topics['landmarks']
+                finding = found('surplus_point', source=topic, count=count, most=most)
+                self._log.warning(f'points of {topic}', finding.text())
             self.add('landmarks', measured, receive_ns)
 
     def add_observations(self, measured: Sequence[ObservationEvent], receive_ns: int) -> None:

@@ -31,6 +31,9 @@ Where an announcement was lost, as on a busy machine, DDS repeats it after 3 s o
 WELL_S = 1.0
 """How long a topic on which messages come is not looked at again."""
 
+HELD_UP_S = 1.0
+"""How long a node that should look at its topics four times a second must not have done so."""
+
 MAX_FULL_NAMES = 3  # of message types in a log line
 
 MessageT = TypeVar('MessageT')
@@ -142,6 +145,9 @@ class InputTopic(Generic[MessageT]):
         self._is_shedding = max_wait_s < math.inf
         self.last_received_s: float | None = None
         self._checked_s = -WELL_S
+        self._looked_s = self._resumed_s = time.monotonic()
+        self._held_s = 0.0  # how long the node itself was busy before it resumed
+        self._clock_ns, self._clock_since_s = 0, self._looked_s
         self._log = ThrottledLog(node, DISCOVERY_S)
         if len(decoders) == 1:
             self._subscribe(next(iter(decoders)))
@@ -154,6 +160,13 @@ class InputTopic(Generic[MessageT]):
         return time.monotonic() - self.last_received_s
 
     @property
+    def silent_s(self) -> float:
+        """How long no message came while the node was there to read it, seconds."""
+        if self.last_received_s is None:
+            return 0.0
+        return time.monotonic() - max(self.last_received_s, self._resumed_s)
+
+    @property
     def problem(self) -> str:
         """Why no message comes, or comes late; empty while they come in time."""
         if self._fault:
@@ -161,10 +174,20 @@ class InputTopic(Generic[MessageT]):
         if self.received == 0:
             wanted = self._type_name or self._wanted
             return f"no message yet on '{self.topic}' ({wanted})"
-        age_s = self.age_s or 0.0
-        if age_s > DISCOVERY_S:
-            return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
         now_s = time.monotonic()
+        if (silent_s := self.silent_s) > DISCOVERY_S:
+            stopped_s = now_s - self._clock_since_s
+            if self._node.get_clock().ros_time_is_active and stopped_s > DISCOVERY_S:
+                return (
+                    f'/clock stands still for {stopped_s:.0f} s, and nothing comes on '
+                    f"'{self.topic}': go on with the simulation or the recording"
+                )
+            return f"no message on '{self.topic}' for {silent_s:.0f} s, though it has a publisher"
+        if self._held_s and now_s - self._resumed_s < DISCOVERY_S:
+            return (
+                f'the node was busy for {self._held_s:.1f} s, in which it read nothing on '
+                f"'{self.topic}': set max_points or max_landmarks lower if it often is"
+            )
         return self.shedding.problem(self.topic, now_s) or self.backlog.problem(self.topic, now_s)
 
     @property
@@ -178,6 +201,7 @@ class InputTopic(Generic[MessageT]):
         While messages come and all was well, that is asked once a second: it takes a while.
         """
         age_s, now_s = self.age_s, time.monotonic()
+        self._note_look(now_s)
         is_well = age_s is not None and age_s < WELL_S and not self._fault
         if is_well and now_s < self._checked_s + WELL_S:
             return
@@ -195,6 +219,19 @@ class InputTopic(Generic[MessageT]):
         self._fault = missing or self._find_fault(publishers, usable)
         if problem := self.problem or (self.doubt and self.doubt.text()):
             self._log.warning(self.topic, problem)
+
+    def begin_looking(self) -> None:
+        """Note that topics were not to be looked at up to now."""
+        self._looked_s = time.monotonic()
+
+    def _note_look(self, now_s: float) -> None:
+        """Note whether the node was held up, or /clock has stood still, since the last look."""
+        if now_s - self._looked_s > HELD_UP_S and (self.last_received_s or 0.0) <= self._looked_s:
+            self._held_s, self._resumed_s = now_s - self._looked_s, now_s
+        self._looked_s = now_s
+        clock_ns = self._node.get_clock().now().nanoseconds
+        if clock_ns != self._clock_ns:
+            self._clock_ns, self._clock_since_s = clock_ns, now_s
 
     def close(self) -> None:
         """Stop receiving."""

@@ -143,7 +143,7 @@ class DiagnosticsPublisher:
         findings += [
             found('silent_input', topic=source.topic)
             for source in self._inputs
-            if not source.problem and (source.age_s or 0.0) > SILENT_S
+            if not source.problem and source.silent_s > SILENT_S
         ]
         if self._feed.is_paused:
             findings.append(found('paused'))
