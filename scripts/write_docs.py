@@ -75,7 +75,8 @@ OUTPUTS = {
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
     'otherwise `map_frame` → `base_frame`',
     '~/is_localised': 'whether the pose is known, as for a behaviour tree: in the loaded map if '
-    'there is one, with standard deviations below `position_error` and `heading_error`',
+    'there is one, with standard deviations below `position_error` and `heading_error`, '
+    'and not contradicted by all that is seen',
     '/diagnostics': 'rates, ages, what was used, what was dropped and why, '
     'and the calibration of the velocity',
 }

@@ -228,7 +228,7 @@ def _as_residuals(observer: Observer, seen: _Points, at: IntArray, rows: IntArra
     a = observer.translations(rows)
     e = seen.points[at] - a
     r, D = e - observer.y_ref[rows], None if seen.D is None else seen.D[at]
-    return Residuals(rows, e, r, a, seen.noise[at], np.zeros(len(rows)), D)
+    return Residuals(rows, e, r, a, seen.noise[at], np.zeros(len(rows)), np.ones(len(rows)), D)
 
 
 def _largest(vectors: FloatArray) -> float:

@@ -168,8 +168,10 @@ class Hypotheses:
 
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
+        stood_s = velocities.stood_s(end_ns)
         for hypothesis in self._all:
             state = hypothesis.state
+            state.observation_noise.stood_s = stood_s
             before = state.observer.A.copy()
             variances = usual.advance(state, velocities, start_ns, end_ns)
             if variances is None:

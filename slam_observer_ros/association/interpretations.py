@@ -33,6 +33,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, are_far, far_from_the_others
+from slam_observer_ros.sensor_models.motion_noise import beyond_driving
 from slam_observer_ros.state.matching import (
     Expected,
     is_contradiction,
@@ -237,6 +238,10 @@ def _after_slip(
     """Take the robot for slipped; return None if that does not explain all of it."""
     settings = state.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
+        return None
+    stands = state.observation_noise.stood_s > 0.0
+    far = beyond_driving(matched.known.points, matched.residuals.r, settings)
+    if stands and not far.all():
         return None
     slipped = state.copy()
     cost = slip(slipped, matched)

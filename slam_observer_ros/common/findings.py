@@ -309,6 +309,12 @@ KINDS = {
     'wrong_pose': Kind(
         Level.WARNING, 'the pose in the map is wrong: {reason}; localising again', GIVE_THE_POSE
     ),
+    'contradicted_pose': Kind(
+        Level.ERROR,
+        'the pose in the map is wrong, or the landmarks in view were moved: all of them are '
+        'rejected',
+        'drive to where more of the map is in view, or give the pose (on initialpose)',
+    ),
     'diverged': Kind(
         Level.ERROR,
         'the estimate has diverged: the pose is {distance_m:.1e} m from its origin; it starts '

@@ -41,19 +41,28 @@ class Estimate:
     def counts(self) -> Counter[str]:
         """How many events were used, by kind, and the outcome for the landmarks in them.
 
-        Events used (``'velocity'``, ``'observation'``), late ones among them
-        (``'late_velocity'``, ``'late_observation'``), points (``'observed_point'``), observations
-        made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
-        (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
-        had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
-        landmarks (``'rejected_landmark'``, ``'rejected_orientation'``, ``'moved_landmark'``,
-        ``'carried_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
-        ``'unsupported_landmark'``, ``'merged_landmark'``, ``'doubled_landmark'``) and points not
-        used (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
-        ``'surplus_point'``, ``'bad_point'``). ``'vague_point'`` counts points that are used,
-        but whose stated covariance says nothing.
+        Events used (``'velocity'``, ``'observation'``), late ones among them (``'late_velocity'``,
+        ``'late_observation'``), points (``'observed_point'``), observations made before the pose
+        in a loaded map was found (``'not_localised'``), how often it was lost (``'lost'``),
+        contradicted by all that is seen (``'contradicted_pose'``) or the estimate has diverged
+        (``'diverged'``), the robot not where odometry had it (``'slip'``) or nothing in view where
+        the map has it (``'unexpected_place'``), landmarks (``'rejected_landmark'``,
+        ``'rejected_orientation'``, ``'moved_landmark'``, ``'carried_landmark'``,
+        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``,
+        ``'merged_landmark'``, ``'doubled_landmark'``) and points not used (``'unknown_id'``,
+        ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``, ``'surplus_point'``,
+        ``'bad_point'``). ``'vague_point'`` counts points that are used, but whose stated
+        covariance says nothing.
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether all that is seen of a loaded map, which does not change, contradicts the pose.
+
+        Behaviour is then not to rely on it, however small its covariance is.
+        """
+        return self._localiser.is_contradicted
 
     @property
     def is_localised(self) -> bool:

@@ -327,6 +327,7 @@ class Estimator(Estimate):
         if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
             self._placement.doubt(*self.uncertain_pose)
         update = self._hypotheses.observe(event)
+        self._timeline.judge_standing(event, update)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
         may_have_moved = self._follow_up(event, update)

@@ -14,12 +14,14 @@ import numpy as np
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import MeasuredVelocity, ObservationEvent, VelocityBlock
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
+from slam_observer_ros.sensor_models.motion_noise import beyond_driving
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.state.covariances import of_moved_pose
@@ -54,7 +56,7 @@ class Timeline:
     def __init__(
         self, hypotheses: Moved, settings: Settings, on_motion: OnMotion | None = None
     ) -> None:
-        self._hypotheses = hypotheses
+        self._hypotheses, self._settings = hypotheses, settings
         timeout_ns = to_ns(settings.velocity_timeout)
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
         self.stamp_ns: int | None = None  # of the last event used; None before the first
@@ -164,6 +166,13 @@ class Timeline:
         self._advance(event.stamp_ns)
         self._in_force_ns = max(self._in_force_ns, event.stamp_ns)
         return event
+
+    def judge_standing(self, event: ObservationEvent, update: Update) -> None:
+        """Doubt that the robot stands where all that it sees is rejected, and far off."""
+        rejects_all = len(update.rejected) > 0 and bool(update.rejected.all())
+        seen = event.points[np.isin(event.ids, update.ids)]
+        if rejects_all and beyond_driving(seen, update.residuals, self._settings).all():
+            self.velocities.doubt_standing()
 
     def knows_motion_since(self, stamp_ns: int) -> bool:
         """Return whether velocities are known from a stamp on."""

@@ -54,6 +54,12 @@ MAX_STEP = 3.0
 LIMIT = 8.0
 """Sum at which the robot is lost."""
 
+CONTRADICTED_TIMES, CONTRADICTED_NS = 3, 500_000_000
+"""Observations in a row, and for how long, that reject all that a fixed map has there.
+
+By then it is no garbled message any more: behaviour trees ask within a second.
+"""
+
 
 class Localiser:
     """Follows whether the estimate is in the frame of a map that was loaded."""
@@ -68,6 +74,7 @@ class Localiser:
         self._finder: Finder | None = None
         self._rough: tuple[FloatArray, FloatArray] | None = None
         self._unexplained = Unexplained()
+        self._contradiction = Contradiction()
         self._said_problem = False
         self._tag: int | None = None  # which the pose was taken from that is on trial
         self._refused: set[int] = set()  # tags whose poses were wrong
@@ -111,6 +118,12 @@ class Localiser:
         self._trial = self._finder = self._rough = self._tag = None
         self._said_problem = False
         self._comparisons, self._unexplained = Comparisons(), Unexplained()
+        self._contradiction = Contradiction()
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether all that is seen of a map that does not change contradicts the pose."""
+        return self._contradiction.lasts
 
     def may_be_rough(self, event: ObservationEvent) -> bool:
         """Return whether points without ids are to be matched by a pose just given."""
@@ -131,6 +144,9 @@ class Localiser:
         """
         if self.loaded is None:
             return None
+        if self.is_localised and not state.is_mapping and self._contradiction.begins(update):
+            self.counts['contradicted_pose'] += 1
+            logger.warning('%s', found('contradicted_pose'))
         reason = None
         if self._trial is not None and self._trial.vote(update, state.settings.max_rejections):
             reason = 'most landmarks contradict the pose that was given'
@@ -301,6 +317,39 @@ class PoseTrial:
         self._for += int(accepted > 0 and accepted >= rejected)
         self._against += int(rejected > accepted)
         return self._against >= often and self._against > self._for
+
+
+class Contradiction:
+    """Whether all landmarks of a map that are seen are rejected, for more than a moment.
+
+    Then the pose is wrong, or somebody has moved the few that are in view. One that was rejected
+    beside others that were where they should be has moved, and says nothing of the pose.
+    """
+
+    def __init__(self) -> None:
+        self._moved: set[int] = set()
+        self._times = self._since_ns = self._last_ns = 0
+
+    @property
+    def lasts(self) -> bool:
+        """Whether that is so now."""
+        is_long = self._last_ns - self._since_ns >= CONTRADICTED_NS
+        return is_long and self._times >= CONTRADICTED_TIMES
+
+    def begins(self, update: Update) -> bool:
+        """Take what an observation has shown; return whether it begins to be so by that."""
+        lasted = self.lasts
+        rejected = set(update.ids[update.rejected].tolist())
+        accepted = set(update.ids[~update.rejected].tolist())
+        if accepted:
+            self._moved = (self._moved | rejected) - accepted
+            self._times = 0
+        elif rejected - self._moved:
+            if not self._times:
+                self._since_ns = update.stamp_ns
+            self._times += 1
+        self._last_ns = update.stamp_ns
+        return self.lasts and not lasted
 
 
 class Unexplained:

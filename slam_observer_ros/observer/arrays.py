@@ -39,7 +39,7 @@ class SeenOrientations:
     Z: FloatArray  # (m, 3, 3) from the tag's own axes
     flipped: FloatArray  # (m, 3, 3) the other orientation that looks nearly the same
     covariances: FloatArray  # (m, 3, 3) of rotation vectors along the body's axes, rad²
-    dt_s: FloatArray  # (m,) seconds since each was seen before, in this run; else infinite
+    repeated: FloatArray  # (m,) by what factor the covariances grow, as errors last
     # (3, c) how they turn with the calibration, reference frame; None where they don't
     D: FloatArray | None = None
 
@@ -50,7 +50,7 @@ class SeenOrientations:
             self.Z[mask],
             self.flipped[mask],
             self.covariances[mask],
-            self.dt_s[mask],
+            self.repeated[mask],
             self.D,
         )
 

@@ -157,15 +157,18 @@ class Gains(ABC):
         points: FloatArray,
         covariances: FloatArray,
         dt_s: FloatArray,
+        repeated: FloatArray,
         D: FloatArray | None = None,
     ) -> Residuals:
         """Return what landmarks ``rows`` (m,) say against X̂ (29).
 
-        ``dt_s`` (m,) is the time since each was last seen.
+        ``dt_s`` (m,) is the time since each was last seen, and ``repeated`` (m,) the factor by
+        which the covariances grow, as errors last.
         """
         observer = self.observer
         e, r = observer.errors(rows, points)
-        return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s, D)
+        turned = observer.turned(covariances)
+        return Residuals(rows, e, r, observer.a[rows], turned, dt_s, repeated, D)
 
     @abstractmethod
     def observe(self, residuals: Residuals) -> FloatArray:

@@ -145,6 +145,7 @@ class Residuals:
     a: FloatArray  # (m, 3) â_i, metres
     covariances: FloatArray  # (m, 3, 3) of the points seen, m²
     dt_s: FloatArray  # (m,) seconds since each was seen before, in this run; else infinite
+    repeated: FloatArray  # (m,) by what factor the covariances grow, as errors last
     # (m, 3, c) how points change with the calibration, reference frame; None where they don't
     D: FloatArray | None = None
 
@@ -177,5 +178,6 @@ class Residuals:
             a=self.a[mask],
             covariances=self.covariances[mask],
             dt_s=self.dt_s[mask],
+            repeated=self.repeated[mask],
             D=None if self.D is None else self.D[mask],
         )

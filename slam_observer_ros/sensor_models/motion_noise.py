@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_observer_ros.common.digits import significant
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.geometry.matrices import (
     diagonal_blocks,
@@ -210,6 +210,19 @@ def _white_s(before_s: FloatArray, dt_s: FloatArray, usual_s: FloatArray) -> Flo
     grown_s = until_s * np.maximum(until_s / usual_s, 1.0)
     grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
     return np.repeat(grown_s, 3, axis=1)
+
+
+def beyond_driving(points: FloatArray, residuals: FloatArray, settings: Settings) -> BoolArray:
+    """Return which points (m, 3) are off by more than the motion of a robot that drives is.
+
+    By the noise of a second of driving, after which a robot whose velocity is zero is taken to
+    stand. What is off by less is an error of the sensor, which stays while the robot does.
+    ``residuals`` are (m, 3), metres.
+    """
+    turned_m = np.linalg.norm(points, axis=1) * max(settings.angular_velocity_noise)
+    noise_m = np.hypot(max(settings.linear_velocity_noise), turned_m)
+    off_m = np.linalg.norm(residuals, axis=1)
+    return np.asarray(off_m > noise_m)
 
 
 class MotionFactors:

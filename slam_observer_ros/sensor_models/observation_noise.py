@@ -36,6 +36,9 @@ MAX_ERROR_M = 1e3
 MIN_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
+LASTING = 0.1
+"""For which share of the time that a robot has stood its sensor's error is taken to last."""
+
 MIN_INTERVAL_S = 1e-3
 """Observations that are less apart count as so far apart: two cameras may see at once."""
 
@@ -56,12 +59,16 @@ class PointFigures(NamedTuple):
 class ObservationNoise:
     """How far observed points may be off, as ``observation_model`` and its figures say.
 
-    ``error_time_s`` is the correlation time of the errors, see :func:`repetition_factors`.
+    Attributes
+    ----------
+    stood_s : float
+        For how long the robot has stood now, 0 while it moves.
+
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.error_time_s = settings.observation_correlation_time
+        self.stood_s = 0.0
 
     def covariances(
         self, event: ObservationEvent, lines_of_sight: FloatArray | None = None
@@ -76,6 +83,21 @@ class ObservationNoise:
         if event.covariances is None:
             return self.at(lines_of_sight)
         return stated_covariances(event.points, event.covariances, lines_of_sight, self.figures)
+
+    @property
+    def error_time_s(self) -> float:
+        """Correlation time of the errors, see :func:`repetition_factors`.
+
+        What a robot sees from one place has the same error, as light and view stay as they are.
+        How slowly that changes nobody knows: it is taken to last for a share of the time for which
+        the robot has stood so far, as flicker noise does. Of its views then only the logarithm of
+        their number counts.
+        """
+        return max(self._settings.observation_correlation_time, LASTING * self.stood_s)
+
+    def repetitions(self, dt_s: FloatArray) -> FloatArray:
+        """Return the factors (m,) of points seen before, as :func:`repetition_factors`."""
+        return repetition_factors(dt_s, self.error_time_s)
 
     def orientation_covariances(self, event: ObservationEvent, Z: FloatArray) -> FloatArray:
         """Return what an observation's orientations may be off by (m, 3, 3), rad².

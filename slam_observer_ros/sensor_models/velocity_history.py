@@ -29,6 +29,18 @@ BLOCK, BLOCKS = 64, 16
 So many that they have pauses in them where these are usual, as of commands.
 """
 
+STANDS_NS = NANOSECONDS_PER_SECOND
+"""How long a velocity must have been exactly zero before the robot stands, nanoseconds.
+
+Commands are ahead of the robot by their delay, and it coasts; both take less than that.
+"""
+
+TURNS = 0.02
+"""Angular velocity beyond which it is not the bias of a gyroscope, rad/s: the robot turns."""
+
+STANDING = 1e-6**2 * np.eye(6)
+"""(6, 6) covariance of the velocity of a robot that stands, rad²/s² and m²/s²: next to none."""
+
 FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
 
@@ -64,12 +76,16 @@ class VelocityHistory:
         self._joined, self._count = _Joined.with_room_for(FIRST_CAPACITY), 1
         self._angular: AngularVelocityEvent | None = None
         self._periods, self._angular_periods = _Periods(), _Periods()
+        self._zero_since_ns: int | None = None  # since when the velocity has been exactly zero
+        self._last_zero_ns = NEVER_NS
+        self._stands = False
 
     def append(self, measured: MeasuredVelocity) -> bool:
         """Add velocities that are not earlier than any other; return whether they are in force.
 
         An angular velocity waits for the first linear one.
         """
+        stand: list[int] = []  # which of the new ones are of a robot that stands
         if isinstance(measured, AngularVelocityEvent):
             self._angular_periods.add(measured.stamp_ns)
             self._angular = measured
@@ -78,22 +94,64 @@ class VelocityHistory:
             first = self._new_row(1)
             self._joined.repeat_last(first, measured.stamp_ns)
             self._joined.usual_s[first, 1] = self._periods.usual_s
+            stand = [first] * self._stands
         elif isinstance(measured, VelocityEvent):
             first, one, usual_s = self._new_row(1), measured, self._took(measured)
             self._joined.write(first, one.stamp_ns, one.body_velocity, one.covariance, usual_s)
+            if any(one.body_velocity.tolist()):
+                self._zero_since_ns, self._stands = None, False
+            else:
+                stand = [first] * self._note_zero(one.stamp_ns)
         else:
             first, many, usual_s = self._new_row(len(measured)), measured, self._took(measured)
             rows = slice(first, self._count)
             self._joined.write(
                 rows, many.stamps_ns, many.body_velocities, many.covariances, usual_s
             )
+            move = np.asarray(many.body_velocities.any(axis=1)).tolist()
+            for row, stamp_ns in enumerate(many.stamps_ns.tolist(), first):
+                if move[row - first]:
+                    self._zero_since_ns, self._stands = None, False
+                elif self._note_zero(stamp_ns):
+                    stand.append(row)
         if (angular := self._angular) is not None:
             self._joined.usual_s[first : self._count, 0] = self._angular_periods.usual_s
             stamps_ns = self._joined.stamps_ns[first : self._count]
             begin = stamps_ns.searchsorted(angular.stamp_ns)
             end = stamps_ns.searchsorted(angular.stamp_ns + self._timeout_ns, 'right')
             self._joined.write_angular(slice(first + begin, first + end), angular)
+        if stand:
+            self._let_stand(np.array(stand))
         return True
+
+    def _note_zero(self, stamp_ns: int) -> bool:
+        """Note a velocity that is exactly zero; return whether the robot stands by then."""
+        since_ns = self._zero_since_ns
+        if since_ns is None or stamp_ns > self._last_zero_ns + self._timeout_ns:
+            self._zero_since_ns = since_ns = stamp_ns
+        self._last_zero_ns = stamp_ns
+        self._stands = stamp_ns >= since_ns + STANDS_NS
+        return self._stands
+
+    def _let_stand(self, rows: IntArray) -> None:
+        """Let velocities (k,) be zero, and be known to be, unless a gyroscope says otherwise."""
+        joined = self._joined
+        turn = np.linalg.norm(joined.body_velocities[rows, :3], axis=1) > TURNS
+        if np.count_nonzero(turn):
+            self.doubt_standing()
+            rows = rows[~turn]
+        joined.body_velocities[rows], joined.covariances[rows] = 0.0, STANDING
+        joined.is_stated[rows] = True
+
+    def doubt_standing(self) -> None:
+        """Begin again to judge whether the robot stands: something else contradicts it."""
+        self._zero_since_ns, self._stands = None, False
+
+    def stood_s(self, stamp_ns: int) -> float:
+        """Return for how long the robot has stood at a stamp, seconds; 0 while it moves."""
+        if not self._stands or self._zero_since_ns is None:
+            return 0.0
+        return to_s(max(stamp_ns - self._zero_since_ns, 0))
 
     def _new_row(self, k: int) -> int:
         """Make room for so many more; return the first."""

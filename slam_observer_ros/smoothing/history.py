@@ -17,7 +17,7 @@ from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
+from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.smoothing.keyframes import (
     joined,
     joined_turns,
@@ -41,7 +41,7 @@ class Keyframe(NamedTuple):
     # (m, 3) from the sensor to where they should be, or to the points if that is not sure, metres
     lines_of_sight: FloatArray
     covariances: FloatArray | None  # (m, 3, 3) of the points, m²; None for the noise model's
-    dt_s: FloatArray  # (m,) seconds since each was seen before; infinite if it was not
+    repeated: FloatArray  # (m,) by what factor the covariances grow, as errors last
     # (m,) how their tags are turned, zero for none; None if that is not estimated
     orientations: SeenOrientations | None = None
     sensed: Sensed | None = None  # (m,) as the sensor showed them, where it is calibrated
@@ -267,7 +267,6 @@ class History:
         """Return keyframes as arrays; ``first`` is the number of the first one."""
         slips = [number for number, link in enumerate(links, first) if link.slip is not None]
         k, numbers = self._axes.point, np.arange(first, first + len(seen))
-        dt_s = np.concatenate([part.dt_s for part in seen])
         return Keyframes(
             links=self._in_frames_of_ends(links),
             slips=np.array(slips, dtype=np.int64),
@@ -278,7 +277,7 @@ class History:
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
-            shares=1.0 / repetition_factors(dt_s, self._observation_noise.error_time_s),
+            shares=1.0 / np.concatenate([part.repeated for part in seen]),
             turns=self._turns(seen),
             sensed=_all_sensed(seen),
         )

@@ -19,7 +19,7 @@ from slam_observer_ros.state.matching import (
     Expected,
     is_contradiction,
     keyframe_of,
-    positions,
+    reject,
 )
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.usual import Corrected, NO_IDS
@@ -76,9 +76,8 @@ def _in_parts(
         if of_all is None or of_used is None or of_used.status == REJECTS:
             return None
     rejected = known & ~used
-    if np.count_nonzero(rejected):
-        state.landmarks.reject(rows[rejected], *positions(state, shown.select(rejected)))
-        state.counts['rejected_landmark'] += int(np.count_nonzero(rejected))
+    if of_all is not None and np.count_nonzero(rejected):
+        reject(state, shown.select(rejected), rows[rejected], of_all.out.r[rejected[known]])
     if len(new.ids):
         enter(state, new, state.observation_noise.covariances(new))
     past = state.relinearisation

@@ -19,6 +19,7 @@ from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.step import LOG_ROOT_2_PI
 from slam_observer_ros.sensor_models import sensing
+from slam_observer_ros.sensor_models.motion_noise import beyond_driving
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.state import State
@@ -110,7 +111,8 @@ def residuals_of(
     D = None
     if event.sensed is not None:
         D = sensitivity(state, event, state.observer.body_points(rows))
-    return state.gains.residuals(rows, event.points, covariances, dt_s, D)
+    repeated = state.observation_noise.repetitions(dt_s)
+    return state.gains.residuals(rows, event.points, covariances, dt_s, repeated, D)
 
 
 def keyframe_of(
@@ -123,17 +125,29 @@ def keyframe_of(
     lines_of_sight, noise = _lines_of_sight(state, event, rows), state.observation_noise
     is_stated = event.covariances is not None
     stated = noise.covariances(event, lines_of_sight) if is_stated else None
-    dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    repeated = noise.repetitions(state.landmarks.unseen_s(rows, event.stamp_ns))
     return Keyframe(
         event.stamp_ns,
         rows,
         event.points,
         lines_of_sight,
         stated,
-        dt_s,
+        repeated,
         orientations,
         event.sensed,
     )
+
+
+def reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray) -> None:
+    """Count points (m,) that were rejected, off by r (m, 3), against their landmarks.
+
+    But not what is off by the sensor's lasting error, while the robot stands: that is no news.
+    """
+    state.counts['rejected_landmark'] += len(rows)
+    if state.observation_noise.stood_s > 0.0:
+        far = beyond_driving(event.points, r, state.settings)
+        event, rows = event.select(far), rows[far]
+    state.landmarks.reject(rows, *positions(state, event))
 
 
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,6 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted
-from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.sensor_models.sensing import turn_sensitivity
 from slam_observer_ros.state.matching import (
     calibrated_again,
@@ -27,6 +26,7 @@ from slam_observer_ros.state.matching import (
     mapped,
     MatchedObservation,
     positions,
+    reject,
     residuals_of,
     sensitivity,
 )
@@ -48,8 +48,7 @@ def step(state: State, matched: MatchedObservation) -> Update:
     _set_velocities(state, event, rows)  # (19)
     innovation = None
     if expected is not None:
-        repeated = repetition_factors(residuals.dt_s, state.observation_noise.error_time_s)
-        innovation = expected.judge(weights, 1.0 / repeated)
+        innovation = expected.judge(weights, 1.0 / residuals.repeated)
     ids, stamp_ns = matched.known.ids, matched.event.stamp_ns
     return state.update(stamp_ns, ids, residuals.r, rejected, moved_ids, innovation)
 
@@ -75,8 +74,7 @@ def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> No
     state.was_contradicted = is_contradiction(rejected)
     state.landmarks.accept(rows[~rejected] if count else rows, event.stamp_ns)
     if count:
-        state.landmarks.reject(rows[rejected], *positions(state, event.select(rejected)))
-        state.counts['rejected_landmark'] += count
+        reject(state, event.select(rejected), rows[rejected], matched.residuals.r[rejected])
 
 
 def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
@@ -251,11 +249,12 @@ def _all_seen(
 ) -> SeenOrientations:
     """Return the orientations (m, 3, 3) in an observation, with their noise."""
     noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
-    dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    unseen_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    repeated = state.observation_noise.repetitions(unseen_s)
     twins, D = flipped(Z, event.lines_of_sight), turn_sensitivity(state.calibration, event)
     if D is not None:
         D = state.observer.A[:3, :3] @ D
-    return SeenOrientations(rows, Z, twins, noise, dt_s, D)
+    return SeenOrientations(rows, Z, twins, noise, repeated, D)
 
 
 def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:

@@ -179,7 +179,8 @@ def correct(
     landmarks = Landmarks(*(column[joint.active] for column in _columns(state)))
     factors = state.motion_noise.factors.flat() if of_all is None else None
     out = _room(state, event, x, with_expected)
-    figures, limits = state.observation_noise.figures, _limits(state.settings)
+    noise = state.observation_noise
+    figures, limits = noise.figures, _limits(state.settings, noise.error_time_s)
     status = core.observe(x, landmarks, seen, figures, limits, factors, out)
     if status == step.UNUSUAL:
         return None
@@ -213,11 +214,11 @@ def _room(state: State, event: ObservationEvent, x: Estimate, with_expected: boo
     )
 
 
-def _limits(settings: Settings) -> Limits:
+def _limits(settings: Settings, error_time_s: float) -> Limits:
     return Limits(
         gate=settings.rejection_threshold,
         huber=settings.huber_threshold,
-        error_time_s=settings.observation_correlation_time,
+        error_time_s=error_time_s,
         confirmations=settings.confirmations,
         max_rejections=settings.max_rejections,
         weighs_meanings=settings.max_hypotheses > 1,
@@ -354,7 +355,7 @@ def keyframe(state: State, event: ObservationEvent, corrected: Corrected) -> Key
         out.points,
         out.lines_of_sight,
         stated,
-        out.dt_s,
+        state.observation_noise.repetitions(out.dt_s),
         None,
         sensed,
     )

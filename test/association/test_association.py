@@ -7,7 +7,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import gain_worlds
-from nameless_points import observe, PLANAR, SPATIAL, stand
+from nameless_points import creep, observe, PLANAR, SPATIAL, stand
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -159,7 +159,7 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
         observe(estimator, 0.1 * step, posts)
     known = estimator.landmark_ids
     for step in range(20, 100):
-        stand(estimator, 0.1 * step)  # at rest, it says; the robot turns to the left by 0.6 rad
+        creep(estimator, 0.1 * step)  # so it says; the robot turns to the left by 0.6 rad
     turned = se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0]))
     seen = se3.transform(se3.inverse(turned), posts)
     for step in range(100, 105):
@@ -188,7 +188,7 @@ def test_of_two_places_the_one_is_given_up_where_more_should_have_been_seen():
         stand(estimator, 0.1 * step)
         observe(estimator, 0.1 * step, posts)
     for step in range(20, 120):
-        stand(estimator, 0.1 * step)  # at rest, it says; the robot turns to the right
+        creep(estimator, 0.1 * step)  # so it says; the robot turns to the right
     turned = se3.exp(np.array([0.0, 0.0, turn_rad, 0.0, 0.0, 0.0]))
     seen = se3.transform(se3.inverse(turned), posts)[:1]
     stand(estimator, 12.0)

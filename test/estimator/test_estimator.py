@@ -297,7 +297,7 @@ def test_while_there_is_room_no_landmark_makes_room_for_a_new_one():
 def test_by_default_a_map_does_not_grow_for_ever_and_it_is_said_once_when_it_is_full(caplog):
     limit = Settings().max_landmarks
     assert 500 <= limit <= 5000
-    estimator = Estimator(Settings(reorder_window=0.0))
+    estimator = Estimator(Settings(reorder_window=0.0, max_points=300))
     noise = np.random.default_rng(0)
     for step in range(12):
         estimator.add(velocity(0.1 * step))

@@ -18,5 +18,10 @@ def observe(estimator, time_s, points, ids=None):
     assert estimator.add(event)
 
 
+def creep(estimator, time_s):
+    """Report next to no velocity; where it is exactly zero, the robot stands, and knows it."""
+    stand(estimator, time_s, (0, 0, 0, 1e-9, 0, 0))
+
+
 def stand(estimator, time_s, body_velocity=(0, 0, 0, 0, 0, 0)):
     assert estimator.add(VelocityEvent(round(time_s * 1e9), np.array(body_velocity, dtype=float)))

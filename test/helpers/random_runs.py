@@ -41,7 +41,9 @@ def residuals_of(
     filter_: Gains, rows: IntArray, points: FloatArray, covariances: FloatArray
 ) -> Residuals:
     """Residuals of landmarks (m,) that are seen at ``points`` (m, 3), body frame."""
-    return filter_.residuals(rows, points, covariances, np.full(len(rows), DT_S))
+    return filter_.residuals(
+        rows, points, covariances, np.full(len(rows), DT_S), np.ones(len(rows))
+    )
 
 
 def observe(

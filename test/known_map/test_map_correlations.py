@@ -485,7 +485,7 @@ def see_tags(rng, filter_, rows):
     turns[:, filter_.axes.turned] = rng.normal(size=(len(rows), filter_.axes.turn))
     noise = 1e-3 * random_covariances(rng, len(rows), 3)
     Z = so3.exp(turns)
-    filter_.add_orientations(SeenOrientations(rows, Z, Z, noise, np.full(len(rows), np.inf)))
+    filter_.add_orientations(SeenOrientations(rows, Z, Z, noise, np.ones(len(rows))))
     random_step(filter_, rng, 1e-3, 1e-2)
 
 

@@ -27,9 +27,17 @@ SETTINGS = ObserverNodeSettings(
 class Watched:
     """A status, and what it publishes."""
 
-    def __init__(self, is_localised=True, stamp_ns=1, deviations=(0.0,) * 6, noise=None):
+    def __init__(
+        self,
+        is_localised=True,
+        stamp_ns=1,
+        deviations=(0.0,) * 6,
+        noise=None,
+        is_contradicted=False,
+    ):
         self.estimator = SimpleNamespace(
             is_localised=is_localised,
+            is_contradicted=is_contradicted,
             stamp_ns=stamp_ns,
             map_name='',
             pose_covariance=None if deviations is None else np.diag(deviations) ** 2,
@@ -54,6 +62,13 @@ class Watched:
     [
         ({'stamp_ns': None}, WARN, 'no estimate yet', False),
         ({'is_localised': False}, ERROR, 'the pose in the loaded map is not known', False),
+        (
+            {'is_contradicted': True},
+            ERROR,
+            'the pose in the map is wrong, or the landmarks in view were moved: all of them are '
+            'rejected',
+            False,
+        ),
         ({'deviations': None}, OK, 'localised; the gains know no standard deviation', True),
         ({}, OK, 'localised', True),
         ({'deviations': (0, 0, 0, 0.2, 0, 0)}, WARN, 'position uncertain: σ = 0.20 m', True),

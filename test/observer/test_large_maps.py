@@ -133,7 +133,7 @@ class World:
             noise[:, :2] = 0.0
         Z = self.pose[:3, :3].T @ self.orientations[ids] @ so3.exp(noise)
         R = np.tile(0.01 * np.eye(3), (len(ids), 1, 1))
-        return SeenOrientations(rows, Z, Z, R, np.full(len(ids), 0.1))
+        return SeenOrientations(rows, Z, Z, R, np.ones(len(ids)))
 
     def remove(self, filters, rows):
         for filter_ in filters:

@@ -231,7 +231,8 @@ def test_the_error_of_lost_wheels_goes_on_beside_an_imu(imu_rate_hz):
     settings = Settings(linear_velocity_noise=(0.02,) * 3)
     history, end_ns = VelocityHistory(SECOND), 2 * SECOND
     imu = [AngularVelocityEvent(t, np.zeros(3)) for t in range(0, end_ns, SECOND // imu_rate_hz)]
-    wheels = [VelocityEvent(t, np.zeros(6)) for t in range(0, end_ns, SECOND // 20)]
+    creeps = np.array([0.0, 0.0, 0.0, 1e-9, 0.0, 0.0])  # exactly zero, it would stand
+    wheels = [VelocityEvent(t, creeps) for t in range(0, end_ns, SECOND // 20)]
     lost_since_ns = 12 * SECOND // 10
     kept = [event for event in wheels if event.stamp_ns <= lost_since_ns]
     for event in sorted([*kept, *imu], key=lambda event: event.stamp_ns):

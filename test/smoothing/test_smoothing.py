@@ -242,8 +242,9 @@ def test_relinearising_takes_the_noise_of_where_a_landmark_was_found_to_be(monke
     estimator = Estimator(settings)
     points = np.array([[4.0, 0.0, 0.0], [3.2, 2.4, 0.0], [3.2, 0.0, 2.4]])
     turned = points @ so3.exp(np.array([0.0, 0.0, 0.2]))
+    creeps = np.array([0.0, 0.0, 0.0, 1e-9, 0.0, 0.0])  # exactly zero, it would stand
     for step, seen in enumerate([points, points, points, turned]):
-        estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
+        estimator.add(VelocityEvent(step * 10**9, creeps))
         estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))
     there = ObservationNoise(settings).covariances(ObservationEvent(0, np.arange(3), turned))
     taken = ObservationNoise(settings).at(noted[-1].lines_of_sight)

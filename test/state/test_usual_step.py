@@ -76,7 +76,7 @@ def parts(state):
         if latest is None or latest.covariances is None
         else latest.covariances,
         'points': np.zeros(0) if latest is None else latest.points,
-        'since': np.zeros(0) if latest is None else np.nan_to_num(latest.dt_s, posinf=1e6),
+        'since': np.zeros(0) if latest is None else np.nan_to_num(latest.repeated, posinf=1e6),
     }
 
 

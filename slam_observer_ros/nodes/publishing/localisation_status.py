@@ -9,7 +9,7 @@ import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Bool
 
-from slam_observer_ros.common.findings import Finding, Level
+from slam_observer_ros.common.findings import Finding, found, Level
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
@@ -124,6 +124,8 @@ class LocalisationStatus:
             return DiagnosticStatus.WARN, 'no estimate yet'
         if not estimator.is_localised:
             return DiagnosticStatus.ERROR, 'the pose in the loaded map is not known'
+        if estimator.is_contradicted:
+            return DiagnosticStatus.ERROR, found('contradicted_pose').what
         if deviations is None:
             return DiagnosticStatus.OK, 'localised; the gains know no standard deviation'
         position_m, heading_rad = deviations

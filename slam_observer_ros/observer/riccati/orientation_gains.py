@@ -21,7 +21,7 @@ from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Residuals
 from slam_observer_ros.observer.robust import accepted, distances, observation_weights
-from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
+from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD
 
 
 class OrientationGains(Gains):
@@ -98,11 +98,8 @@ class OrientationGains(Gains):
         # K = P Hᵀ S⁻¹, X̂ ← exp(−K φ) · X̂
         used = weights > 0.0
         if used.any():
-            repeated = repetition_factors(
-                seen.dt_s[used], self._settings.observation_correlation_time
-            )
             HP, HPH = self.joint.project_turns(seen.rows[used], seen.D)
-            S = with_blocks(HPH, R[used] / (weights[used] / repeated)[:, None, None])
+            S = with_blocks(HPH, R[used] * (seen.repeated[used] / weights[used])[:, None, None])
             self._move(-self.joint.update(HP, S, phi[used].ravel()))
         return weights, are_unclear
 

@@ -32,7 +32,6 @@ from slam_observer_ros.observer.riccati.covariances import CompressedCovariance,
 from slam_observer_ros.observer.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.observer.robust import AT_ONCE, observation_weights
 from slam_observer_ros.sensor_models.motion import Motion
-from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
@@ -100,11 +99,12 @@ class RiccatiGains(OrientationGains):
         points: FloatArray,
         covariances: FloatArray,
         dt_s: FloatArray,
+        repeated: FloatArray,
         D: FloatArray | None = None,
     ) -> Residuals:
         """Return what landmarks (m,), which are going to correct the state, say against it."""
         self.joint.activate(rows)
-        return super().residuals(rows, points, covariances, dt_s, D)
+        return super().residuals(rows, points, covariances, dt_s, repeated, D)
 
     def observe(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
@@ -134,8 +134,7 @@ class RiccatiGains(OrientationGains):
         passed, used = weights > 0.0, residuals
         if np.count_nonzero(passed) < len(r):
             used, r, R = residuals.select(passed), r[passed], R[passed]
-        repeated = repetition_factors(used.dt_s, self._settings.observation_correlation_time)
-        R = R * (repeated / weights[passed])[:, None, None]
+        R = R * (used.repeated / weights[passed])[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
         return self.joint.correct(self.joint.output_matrix(used), used.rows, R, r), weights
 

@@ -1,0 +1,137 @@
+"""A robot stands for most of its life: its pose stays as it is, and as sure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    ObservationEvent,
+    VelocityBlock,
+    VelocityEvent,
+)
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.sensor_models.velocity_history import STANDS_NS, TURNS, VelocityHistory
+from slam_observer_ros.settings.estimator_settings import Settings
+
+PERIOD_NS = 50_000_000
+SECOND = 10**9
+POINTS = np.array([[2.0, 0.3, 0.2], [3.0, -1.0, 0.3], [3.0, 1.5, 0.4], [-2.0, 1.0, 0.1]])
+SETTINGS = Settings(reorder_window=0.0, point_noise=0.03, observation_model='cartesian')
+V = np.array([0.0, 0.0, 0.1, 0.3, 0.0, 0.0])
+
+
+class Robot:
+    """Drives, stands, and is pushed; odometry does not notice the last."""
+
+    def __init__(self, settings=SETTINGS):
+        self.estimator, self.rng = Estimator(settings), np.random.default_rng(0)
+        self.A, self.stamp_ns = np.eye(4), 0
+
+    def run(self, seconds, rows, V=V, pushed=None, wander=0.0):
+        """Go on for some time, seeing landmarks ``rows`` ten times a second."""
+        for step in range(round(seconds * SECOND / PERIOD_NS)):
+            self.estimator.add(VelocityEvent(self.stamp_ns, V))
+            self.A = self.A @ se3.exp(PERIOD_NS / SECOND * (V if pushed is None else pushed))
+            self.stamp_ns += PERIOD_NS
+            if len(rows) and step % 2:
+                seen = se3.transform(se3.inverse(self.A), POINTS[rows])
+                seen += wander + 0.01 * self.rng.normal(size=seen.shape)
+                self.estimator.add(ObservationEvent(self.stamp_ns, np.array(rows), seen))
+        self.estimator.flush()
+
+    @property
+    def error_m(self):
+        return float(np.linalg.norm(self.estimator.pose[:3, 3] - self.A[:3, 3]))
+
+    @property
+    def sigmas(self):
+        return np.sqrt(np.diag(self.estimator.pose_covariance))
+
+
+@pytest.mark.parametrize('rows', [[], [0], [0, 1, 2]], ids=['dark', 'one landmark', 'three'])
+@pytest.mark.parametrize('wander', [0.0, 0.02])
+def test_after_a_long_time_at_rest_it_is_where_it_was_and_as_sure(rows, wander):
+    robot = Robot()
+    robot.run(10.0, [0, 1, 2, 3])
+    robot.run(2.0, rows, np.zeros(6))
+    before, pose = robot.sigmas, robot.estimator.pose
+    robot.run(300.0, rows, np.zeros(6), wander=wander)
+    assert (robot.sigmas < 1.05 * before + 1e-4).all()
+    assert np.linalg.norm(robot.estimator.pose[:3, 3] - pose[:3, 3]) < 0.01 + 1.8 * wander
+    # What is seen again and again from one place makes it no surer than a few views do.
+    assert (robot.sigmas > 0.3 * before).all()
+    assert robot.estimator.counts['slip'] == robot.estimator.counts['moved_landmark'] == 0
+    robot.run(10.0, [0, 1, 2, 3])
+    assert robot.error_m < 0.05
+    assert robot.estimator.counts['slip'] == 0
+
+
+@pytest.mark.parametrize('rows', [[0], [0, 1, 2]])
+def test_a_robot_that_is_pushed_with_its_wheels_locked_is_noticed(rows):
+    covariances = np.tile(1e-4 * np.eye(3), (4, 1, 1))
+    known = LandmarkMap(np.arange(4), POINTS, covariances, np.zeros(4, dtype=np.int64))
+    robot = Robot(replace(SETTINGS, localization_mode='fixed'))
+    robot.estimator.load_map(known, np.eye(4), 1e-4 * np.eye(6))
+    robot.run(5.0, [0, 1, 2, 3])
+    robot.run(60.0, rows, np.zeros(6))
+    robot.run(2.0, rows, np.zeros(6), pushed=0.3 * np.eye(6)[3])
+    robot.run(5.0, rows, np.zeros(6))
+    is_sure = robot.error_m < 3.0 * np.linalg.norm(robot.sigmas[3:])
+    assert is_sure or robot.estimator.is_contradicted
+    if len(rows) > 1:
+        assert robot.error_m < 0.1
+
+
+def variances(history, start_ns, end_ns):
+    held = history.held(start_ns, end_ns)
+    return held.is_stated.all(), np.diagonal(held.covariances, axis1=1, axis2=2).max()
+
+
+def test_standing_begins_after_a_second_of_zeros_and_ends_at_once():
+    history = VelocityHistory(SECOND)
+    moves = [0, *range(60, 70)]
+    for step in range(80):
+        velocity = V if step in moves else np.zeros(6)
+        history.append(VelocityEvent(step * PERIOD_NS, velocity))
+        stood_ns = (step - 1) * PERIOD_NS
+        stands = step not in moves and step < 60 and stood_ns >= STANDS_NS
+        assert history.stood_s(step * PERIOD_NS) == (stood_ns / SECOND if stands else 0.0)
+    assert variances(history, 30 * PERIOD_NS, 59 * PERIOD_NS) == (True, 1e-12)
+    assert variances(history, PERIOD_NS, 10 * PERIOD_NS) == (False, 0.0)
+
+
+def test_a_driver_that_falls_silent_does_not_stand():
+    history = VelocityHistory(SECOND // 2)
+    for stamp_ns in (0, SECOND // 4, 5 * SECOND, 5 * SECOND + SECOND // 4):
+        history.append(VelocityEvent(stamp_ns, np.zeros(6)))
+        assert history.stood_s(stamp_ns) == 0.0
+
+
+def test_velocities_in_a_block_stand_as_single_ones_do():
+    stamps_ns = PERIOD_NS * np.arange(100)
+    velocities = np.where((stamps_ns % (2 * SECOND) < SECOND // 5)[:, None], V, 0.0)
+    one, many = VelocityHistory(SECOND), VelocityHistory(SECOND)
+    for stamp_ns, velocity in zip(stamps_ns.tolist(), velocities, strict=True):
+        one.append(VelocityEvent(stamp_ns, velocity))
+    many.append(VelocityBlock(stamps_ns, velocities))
+    for first, second in zip(one.flat(), many.flat(), strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert one.flat().is_stated.any()
+
+
+@pytest.mark.parametrize(('rate', 'stands'), [(0.5 * TURNS, True), (2.0 * TURNS, False)])
+def test_wheels_that_stand_overrule_the_bias_of_a_gyroscope_but_not_a_turn(rate, stands):
+    history, turns = VelocityHistory(SECOND), np.array([0.0, 0.0, rate])
+    for step in range(60):
+        history.append(VelocityEvent(step * PERIOD_NS, np.zeros(6)))
+        history.append(AngularVelocityEvent(step * PERIOD_NS + 1, turns))
+    stamp_ns = 60 * PERIOD_NS
+    assert (history.stood_s(stamp_ns) > 0.0) == stands
+    latest = history.latest(stamp_ns - 1)
+    np.testing.assert_array_equal(latest[:3], 0.0 if stands else turns)
