@@ -125,13 +125,29 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
     return limited(given, MAX_POSE_ERRORS) + np.diag(assumed)
 
 
+FAST_M_PER_S = 3.0
+"""Speed beyond which a robot indoors does not drive: its odometry then is another."""
+
+AT_START_M, AT_START_RAD = 0.1, 0.1
+"""How far from its origin an odometry is that has just begun."""
+
+
 class KeptPose:
     """Starts where the robot was when the node ended, unless that was too long ago.
 
-    What can't be read or written is a warning: the robot is localised without it, too.
+    Where the odometry on /tf has gone on meanwhile, by as much as it says. What can't be read or
+    written is a warning: the robot is localised without it, too.
     """
 
-    def __init__(self, node: Node, settings: ObserverNodeSettings, estimator: Estimator) -> None:
+    def __init__(
+        self,
+        node: Node,
+        settings: ObserverNodeSettings,
+        estimator: Estimator,
+        odometry: TransformedOdometry,
+    ) -> None:
+        self._odometry = odometry
+        self._restored: StoredPose | None = None  # until odometry says how the robot has moved
         self._log = ThrottledLog(node)
         self._logger = node.get_logger()
         self._settings = settings
@@ -150,6 +166,7 @@ class KeptPose:
                 # It may have been moved a little meanwhile, as a pose given in RViz may be off.
                 covariance = stored.covariance + np.diag(GIVEN_POSE_STD**2)
                 self._estimator.set_pose(stored.pose, covariance)
+                self._restored = stored
         except SlamObserverError as error:
             reason = str(error)
         if reason:
@@ -157,6 +174,27 @@ class KeptPose:
             return
         x, y, z = stored.pose[:3, 3].tolist()
         self._logger.info(f'the robot is where it was: ({x:.2f}, {y:.2f}, {z:.2f}) m')
+
+    def follow_odometry(self) -> None:
+        """Let a restored pose move on as odometry has, once it is heard, and it has gone on."""
+        stored, update = self._restored, self._estimator.last_update
+        stamp_ns = None if stored is None else self._odometry.newest_ns
+        if stored is None or stamp_ns is None:
+            return
+        self._restored = None
+        then, now = stored.odometry, self._odometry.pose_until(stamp_ns)
+        if then is None or now is None or (update is not None and len(update.ids)):
+            return
+        age_s, motion = time.time() - stored.time_s, se3.inverse(then) @ now
+        way_m = float(np.linalg.norm(motion[:3, 3]))
+        if (_is_at_start(now) and not _is_at_start(then)) or way_m > FAST_M_PER_S * age_s:
+            self._logger.info('the odometry began anew: the robot is taken to be where it was')
+            return
+        s = self._estimator.settings
+        noise = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
+        moved = of_moved_pose(stored.covariance, stored.pose, motion, np.diag(noise**2 * age_s))
+        self._estimator.set_pose(stored.pose @ motion, moved, stamp_ns)
+        self._logger.info(f'by odometry the robot has moved {way_m:.2f} m since')
 
     def keep(self) -> None:
         """Write the present pose, if it is known and new."""
@@ -171,7 +209,8 @@ class KeptPose:
         frame = self._settings.map_frame
         self._stamp_ns = stamp_ns
         try:
-            write_pose(self._path, StoredPose(pose, covariance, frame, time.time()))
+            odometry = self._odometry.pose_until(stamp_ns or 0)
+            write_pose(self._path, StoredPose(pose, covariance, frame, time.time(), odometry))
         except SlamObserverError as error:
             self._log.warning('pose_file', str(error))
 
@@ -184,6 +223,11 @@ class KeptPose:
         if stored.frame_id != self._settings.map_frame:
             return f"it is in frame '{stored.frame_id}', not '{self._settings.map_frame}'"
         return ''
+
+
+def _is_at_start(odometry: FloatArray) -> bool:
+    way_m, turn_rad = np.linalg.norm(se3.log(odometry).reshape(2, 3), axis=1)[::-1]
+    return bool(way_m < AT_START_M and turn_rad < AT_START_RAD)
 
 
 FORMAT = 'slam_observer_ros pose'
@@ -199,6 +243,7 @@ class StoredPose:
     covariance: FloatArray  # (6, 6) of rotation vector and position along the map's axes
     frame_id: str
     time_s: float  # since 1970
+    odometry: FloatArray | None = None  # (4, 4) the base in odom_frame then, if that is on /tf
 
 
 def write_pose(path: Path, stored: StoredPose) -> None:
@@ -211,6 +256,9 @@ def write_pose(path: Path, stored: StoredPose) -> None:
         'orientation': so3.to_quaternion(stored.pose[:3, :3]).tolist(),
         'covariance': stored.covariance.ravel().tolist(),
     }
+    if stored.odometry is not None:
+        R, x = stored.odometry[:3, :3], stored.odometry[:3, 3]
+        content['odometry'] = [*x.tolist(), *so3.to_quaternion(R).tolist()]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished_file(path) as file:
@@ -231,16 +279,23 @@ def read_pose(path: Path) -> StoredPose:
         raise MapError(f"{path} has no line 'format: {FORMAT}'")
     values = {name: _numbers(path, content, name, size) for name, size in SIZES.items()}
     (time_s,) = _numbers(path, {'time': [content.get('time')]}, 'time', 1)
-    quaternion = values['orientation']
-    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
-        raise MapError(f"the pose {path}: 'orientation' is no unit quaternion")
-    rotation = so3.from_quaternion(quaternion)
+    odometry = None
+    if 'odometry' in content:
+        numbers = _numbers(path, content, 'odometry', 7)
+        odometry = _pose(path, 'odometry', numbers[:3], numbers[3:])
     return StoredPose(
-        se3.pose(rotation, values['position']),
+        _pose(path, 'orientation', values['position'], values['orientation']),
         values['covariance'].reshape(6, 6),
         str(content.get('frame')),
         float(time_s),
+        odometry,
     )
+
+
+def _pose(path: Path, name: str, position: FloatArray, quaternion: FloatArray) -> FloatArray:
+    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
+        raise MapError(f"the pose {path}: '{name}' is no unit quaternion")
+    return se3.pose(so3.from_quaternion(quaternion), position)
 
 
 def _numbers(path: Path, content: dict[str, Any], name: str, size: int) -> FloatArray:

@@ -277,7 +277,7 @@ class ObserverCore:
         controls = ControlServices(node, flow.estimator, flow.feed, flow.output, odometry)
         self._maps = MapServices(node, settings, flow.estimator, controls.note_move)
         NamedMapServices(node, self._maps)
-        self._kept_pose = KeptPose(node, settings, flow.estimator)
+        self._kept_pose = KeptPose(node, settings, flow.estimator, odometry)
         self._kept_pose.restore()
         InitialPoseListener(node, settings.map_frame, flow.estimator, odometry, controls.note_move)
         node.add_post_set_parameters_callback(self._apply_parameters)
@@ -302,6 +302,7 @@ class ObserverCore:
             self._flow.output.reset()
         for source in self._flow.inputs:
             source.check_publishers()
+        self._kept_pose.follow_odometry()
         self._localisation.publish()
 
     def _is_finite(self) -> bool:

@@ -213,16 +213,16 @@ def _white_s(before_s: FloatArray, dt_s: FloatArray, usual_s: FloatArray) -> Flo
 
 
 def beyond_driving(points: FloatArray, residuals: FloatArray, settings: Settings) -> BoolArray:
-    """Return which points (m, 3) are off by more than the motion of a robot that drives is.
+    """Return which points (m, 3) are further off than the noise of driving explains.
 
-    By the noise of a second of driving, after which a robot whose velocity is zero is taken to
-    stand. What is off by less is an error of the sensor, which stays while the robot does.
+    By the gate, and the noise of a second of driving, after which a robot whose velocity is zero
+    is taken to stand. What is off by less is an error of the sensor, which stays while it does.
     ``residuals`` are (m, 3), metres.
     """
     turned_m = np.linalg.norm(points, axis=1) * max(settings.angular_velocity_noise)
     noise_m = np.hypot(max(settings.linear_velocity_noise), turned_m)
     off_m = np.linalg.norm(residuals, axis=1)
-    return np.asarray(off_m > noise_m)
+    return np.asarray(off_m > settings.rejection_threshold * noise_m)
 
 
 class MotionFactors:

@@ -30,6 +30,9 @@ POSE = se3.from_rpy((1.0, -2.0, 0.0, 0.0, 0.0, 0.7))
 COVARIANCE = np.diag([0.0, 0.0, 0.01, 0.04, 0.04, 0.0])
 
 
+NO_ODOMETRY = SimpleNamespace(newest_ns=None, pose_until=lambda stamp_ns: None)
+
+
 @pytest.fixture(name='kept')
 def fixture_kept(tmp_path, monkeypatch):
     """A kept pose in a file, the estimator that it is for, and what the clock says."""
@@ -38,14 +41,48 @@ def fixture_kept(tmp_path, monkeypatch):
     path = tmp_path / 'deep' / 'pose.yaml'
     node, estimator = Mock(), Estimator(Settings(two_d_mode=True))
     settings = ObserverNodeSettings(pose_file=str(path), pose_file_max_age=60.0)
-    part = KeptPose(node, settings, estimator)
-    return SimpleNamespace(
-        part=part, path=path, clock=clock, estimator=estimator, log=node.get_logger()
+    odometry = SimpleNamespace(
+        newest_ns=None, pose_until=lambda stamp_ns: odometry.pose, pose=None
     )
+    part = KeptPose(node, settings, estimator, odometry)
+    return SimpleNamespace(
+        part=part, path=path, clock=clock, estimator=estimator, log=node.get_logger(),
+        odometry=odometry,
+    )  # fmt: skip
 
 
 def stored(frame_id='map', time_s=1e9):
     return StoredPose(POSE, COVARIANCE, frame_id, time_s)
+
+
+THEN = se3.from_rpy((7.0, 1.0, 0.0, 0.0, 0.0, -0.4))
+MOTION = se3.from_rpy((1.5, 0.2, 0.0, 0.0, 0.0, 0.9))
+
+
+@pytest.mark.parametrize(
+    ('odometry', 'moved'),
+    [
+        (THEN @ MOTION, MOTION),
+        (np.eye(4), np.eye(4)),  # it began anew
+        (se3.from_rpy((90.0, 1.0, 0.0, 0.0, 0.0, 0.0)), np.eye(4)),  # it is another
+    ],
+    ids=['went on', 'began anew', 'another'],
+)
+def test_a_kept_pose_moves_on_as_odometry_has(kept, odometry, moved):
+    write_pose(kept.path, StoredPose(POSE, COVARIANCE, 'map', 1e9, THEN))
+    assert_allclose(read_pose(kept.path).odometry, THEN, atol=1e-12)
+    kept.clock.now_s += 4.0
+    kept.part.restore()
+    kept.part.follow_odometry()  # it is not heard yet
+    assert_allclose(kept.estimator.pose, POSE, atol=1e-9)
+    kept.odometry.newest_ns, kept.odometry.pose = 10**9, odometry
+    kept.part.follow_odometry()
+    assert_allclose(kept.estimator.pose, POSE @ moved, atol=1e-9)
+    deviation = np.sqrt(kept.estimator.pose_covariance[3, 3])
+    assert (deviation > 0.45) == (moved is not MOTION)
+    kept.odometry.pose = odometry @ MOTION
+    kept.part.follow_odometry()  # once is enough
+    assert_allclose(kept.estimator.pose, POSE @ moved, atol=1e-9)
 
 
 def test_a_pose_is_read_as_it_was_written(tmp_path):
@@ -85,7 +122,7 @@ def test_what_can_be_no_file_neither_blocks_nor_ends_the_node(tmp_path, name):
     (tmp_path / 'folder').mkdir()
     node = Mock()
     settings = ObserverNodeSettings(pose_file=str(tmp_path / name))
-    part = KeptPose(node, settings, Estimator(Settings()))
+    part = KeptPose(node, settings, Estimator(Settings()), NO_ODOMETRY)
     part.restore()
     part._estimator.add(VelocityEvent(1, np.zeros(6)))
     part._estimator.release()
@@ -140,7 +177,7 @@ def test_a_file_that_cannot_be_written_is_a_warning(tmp_path):
     estimator.add(VelocityEvent(1, np.zeros(6)))
     estimator.release()
     settings = ObserverNodeSettings(pose_file=str(tmp_path))
-    KeptPose(node, settings, estimator).keep()
+    KeptPose(node, settings, estimator, NO_ODOMETRY).keep()
     assert "can't write the pose" in node.get_logger().warning.call_args.args[0]
 
 

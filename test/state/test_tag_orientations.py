@@ -31,7 +31,8 @@ def drive(settings, turn_rad=0.15, with_orientation=True, flips=(), seconds=20):
     estimator, rng = Estimator(settings), np.random.default_rng(0)
     for k in range(10 * seconds):
         A = se3.exp(np.array([0.0, 0.0, turn_rad if k >= 20 else 0.0, 0.0, 0.0, 0.0]))
-        estimator.add(VelocityEvent(k * 10**8, np.zeros(6)))
+        # With a velocity of exactly zero it would stand, and know it.
+        estimator.add(VelocityEvent(k * 10**8, np.array([0.0, 0.0, 0.0, 1e-9, 0.0, 0.0])))
         if 20 <= k < 60:  # it turns now, and says nothing of it
             continue
         back = se3.inverse(A)
