@@ -41,8 +41,14 @@ TAG_SIZE_M = 0.16
 FOCAL_LENGTH_PX, PIXEL_NOISE_PX = 600.0, 0.5
 """By which the range r of a tag, known from its size s in the image, is off by σ r² / (f s)."""
 
-BEARING_NOISE_RAD, ORIENTATION_NOISE_RAD = 0.003, 0.05
+BEARING_NOISE_RAD, ORIENTATION_NOISE_RAD = 0.005, 0.05
 """Standard deviations across the line of sight, with the camera's calibration; of the tag."""
+
+ERROR_TIME_S = 2.0
+"""How long a tag is seen off by about the same, as light and view hardly change."""
+
+WHEEL_NOISE = 0.02
+"""Of turning and of driving, rad/√s and m/√s: what slips at random."""
 
 
 def true_pose(time_s: float) -> FloatArray:
@@ -98,26 +104,40 @@ class WheelOdometry:
         """Measure the motion between two true poses (4, 4)."""
         motion = se3.log(se3.inverse(before) @ after) / dt_s
         noise = self.random.standard_normal(2) / np.sqrt(dt_s)
-        self.turn_rad_s = self.turn_scale * motion[2] + 0.005 * noise[0]
-        self.forward_m_s = self.forward_scale * motion[3] + 0.005 * noise[1]
+        self.turn_rad_s = self.turn_scale * motion[2] + WHEEL_NOISE * noise[0]
+        self.forward_m_s = self.forward_scale * motion[3] + WHEEL_NOISE * noise[1]
         measured = np.array([0.0, 0.0, self.turn_rad_s, self.forward_m_s, 0.0, 0.0])
         self.pose = self.pose @ se3.exp(measured * dt_s)
 
 
+class TagErrors:
+    """By what each of ``count`` tags is seen off, in standard deviations (k, 7), as time goes by.
+
+    Across the image, along the line of sight, and turned.
+    """
+
+    def __init__(self, random: np.random.Generator, count: int) -> None:
+        self._random = random
+        self.values: FloatArray = random.standard_normal((count, 7))
+
+    def go_on(self, dt_s: float) -> None:
+        """Let some of the errors be new (Gauss–Markov)."""
+        kept = np.exp(-dt_s / ERROR_TIME_S)
+        new = self._random.standard_normal(self.values.shape)
+        self.values = kept * self.values + np.sqrt(1.0 - kept**2) * new
+
+
 def sightings(
-    pose: FloatArray,
-    tags: FloatArray,
-    random: np.random.Generator,
-    tag_size_m: float = TAG_SIZE_M,
+    pose: FloatArray, tags: FloatArray, errors: FloatArray, tag_size_m: float = TAG_SIZE_M
 ) -> dict[int, FloatArray]:
     """Return which of ``tags`` (k, 4, 4) are in view of a robot at ``pose`` (4, 4).
 
-    From ids to poses (4, 4) in the camera's optical frame.
+    From ids to poses (4, 4) in the camera's optical frame; ``errors`` (k, 7) are TagErrors'.
     """
     seen = {}
     for tag_id, tag in enumerate(se3.inverse(pose @ CAMERA) @ tags):
         if _is_in_view(tag):
-            seen[tag_id] = _measured(tag, random, tag_size_m)
+            seen[tag_id] = _measured(tag, errors[tag_id], tag_size_m)
     return seen
 
 
@@ -133,14 +153,14 @@ def _is_in_view(tag: FloatArray) -> bool:
     )
 
 
-def _measured(tag: FloatArray, random: np.random.Generator, tag_size_m: float) -> FloatArray:
+def _measured(tag: FloatArray, errors: FloatArray, tag_size_m: float) -> FloatArray:
     position = tag[:3, 3]
     range_m = float(np.linalg.norm(position))
     along = position / range_m
-    off = random.standard_normal(3) * BEARING_NOISE_RAD * range_m
+    off = errors[:3] * BEARING_NOISE_RAD * range_m
     range_noise_m = PIXEL_NOISE_PX * range_m**2 / (FOCAL_LENGTH_PX * tag_size_m)
-    off += along * (range_noise_m * random.standard_normal() - along @ off)
-    turned = so3.exp(random.standard_normal(3) * ORIENTATION_NOISE_RAD) @ tag[:3, :3]
+    off += along * (range_noise_m * errors[3] - along @ off)
+    turned = so3.exp(errors[4:] * ORIENTATION_NOISE_RAD) @ tag[:3, :3]
     return se3.pose(turned, position + off)
 
 

@@ -72,6 +72,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._odometry = hall.WheelOdometry(self._random)
         self._truth = hall.true_pose(0.0)
         self._tag_poses = hall.tag_poses()
+        self._tag_errors = hall.TagErrors(self._random, len(self._tag_poses))
         self._steps = 0
         self._correction: FloatArray | None = None
         self.seen: list[Seen] = []
@@ -149,7 +150,8 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         return len(points)
 
     def _publish_tags(self, stamp_ns: int) -> int:
-        tags = hall.sightings(self._truth, self._tag_poses, self._random)
+        self._tag_errors.go_on(ODOMETRY_PER_IMAGE / ODOMETRY_HZ)
+        tags = hall.sightings(self._truth, self._tag_poses, self._tag_errors.values)
         transforms = [
             MESSAGES.transform_stamped(stamp_ns, CAMERA_FRAME, f'tag36h11:{tag_id}', pose)
             for tag_id, pose in tags.items()

@@ -46,7 +46,8 @@ def test_the_page_on_nav2_has_the_command_that_is_run():
 def test_what_the_camera_sees_is_in_front_of_it_and_faces_it():
     random = np.random.default_rng(0)
     tags = hall.tag_poses()
-    seen = [hall.sightings(hall.true_pose(t), tags, random) for t in np.arange(0.0, hall.LAP_S)]
+    errors = random.standard_normal((len(tags), 7))
+    seen = [hall.sightings(hall.true_pose(t), tags, errors) for t in np.arange(0.0, hall.LAP_S)]
     assert {len(each) for each in seen} == {0, 1, 2, 3}
     for each in seen:
         for pose in each.values():
@@ -59,7 +60,8 @@ def test_a_sighting_is_where_the_tag_is_within_its_noise():
     tags = hall.tag_poses()
     for time_s in np.arange(0.0, hall.LAP_S):
         pose = hall.true_pose(time_s)
-        for tag_id, seen in hall.sightings(pose, tags, random).items():
+        errors = random.standard_normal((len(tags), 7))
+        for tag_id, seen in hall.sightings(pose, tags, errors).items():
             in_map = pose @ hall.CAMERA @ seen
             assert_allclose(in_map[:3, 3], tags[tag_id][:3, 3], atol=0.8)
 
