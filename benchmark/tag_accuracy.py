@@ -79,8 +79,8 @@ def run(every: int, size_m: float, seed: int, duration_s: float) -> np.ndarray:
         estimator.add(VelocityEvent(stamp_ns, np.array([0.0, 0.0, turn, forward, 0.0, 0.0])))
         if step % PER_IMAGE:
             continue
-        errors = random.standard_normal((len(tags), 7))
-        if seen := hall.sightings(truth, tags, errors, size_m):
+        off = random.standard_normal((len(tags), 7))
+        if seen := hall.sightings(truth, tags, off, size_m):
             points = se3.transform(hall.CAMERA, np.array([pose[:3, 3] for pose in seen.values()]))
             estimator.add(ObservationEvent(stamp_ns, np.array(list(seen)), points))
         if estimator.is_localised and step > SETTLED_S * RATE_HZ:
