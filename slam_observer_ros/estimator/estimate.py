@@ -245,7 +245,7 @@ class Estimate:
         With ``smoothing_window`` 0 that is the whole run. Raise ParameterError if no history is
         kept, and SmoothingError if the observations don't determine everything.
         """
-        return self._state.smooth()
+        return self._state.copy().smooth()  # what is postponed stays so: bits do not change
 
     @property
     def lyapunov(self) -> float:

@@ -18,6 +18,7 @@ from slam_observer_ros.state.matching import (
     enter,
     Expected,
     is_contradiction,
+    keep,
     keyframe_of,
     reject,
 )
@@ -82,7 +83,7 @@ def _in_parts(
         enter(state, new, state.observation_noise.covariances(new))
     past = state.relinearisation
     if past.is_active:
-        past.add(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)), in_doubt=False)
+        keep(state, keyframe_of(state, shown, state.landmarks.rows_of(event.ids)))
     expected = None if of_used is None else usual.expected(state, of_used.out)
     return _update(state, event, known, rejected[known], of_all, of_used), expected
 

@@ -55,7 +55,8 @@ def test_starry_night(slam_observer, recordings, gains, ate_m, configuration_m):
     ('gains', 'ate_m', 'configuration_m'),
     [
         ('constant', 0.660, 1.027),
-        ('riccati', 0.267, 0.284),
+        # Of this robot it hangs on how it comes out of 78 s without a landmark.
+        ('riccati', 0.267, 0.332),
     ],
 )
 def test_mrclam(slam_observer, recordings, gains, ate_m, configuration_m):

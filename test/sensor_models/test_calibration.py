@@ -275,7 +275,7 @@ def test_a_robot_at_rest_again_is_where_its_velocities_say_whatever_their_delay(
         estimator.add(ObservationEvent(step * DELAY_NS, np.arange(0), np.empty((0, 3))))
         deviation = np.sqrt(np.max(np.diagonal(estimator.pose_covariance)))
         assert deviation > 0.01 or not 12 <= step < 48
-    assert deviation < 1e-6
+    assert deviation < 1e-3  # it stands now, which is known to so much
 
 
 def test_calibration_makes_the_map_better_where_the_wheels_are_off():
