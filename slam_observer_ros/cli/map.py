@@ -19,7 +19,7 @@ from slam_observer_ros.known_map.map_check import (
     Symmetry,
 )
 from slam_observer_ros.known_map.map_file import read_map, write_map
-from slam_observer_ros.known_map.map_import import import_map, TAG_AXES
+from slam_observer_ros.known_map.map_import import import_map, LENGTHS, TAG_AXES
 from slam_observer_ros.settings.estimator_settings import Settings
 
 
@@ -36,7 +36,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'of apriltag_ros for ROS 1: poses in the frame of the bundle.',
     )
     convert.add_argument(
-        'file', type=named_path, metavar='FILE', help='.csv, .tsv, .txt, .yaml or .json'
+        'file',
+        type=named_path,
+        metavar='FILE',
+        help='.csv, .tsv, .txt, .yaml, .json, or .imk and .lmk of a navigation scanner',
     )
     convert.add_argument('output', type=named_path, metavar='OUT.yaml', help='map file to make')
     convert.add_argument(
@@ -62,6 +65,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default='right-up-out',
         help='x, y and z of a tag as your detector reports them, seen from before the tag '
         "(default right-up-out, as apriltag_ros's); none for positions only",
+    )
+    convert.add_argument(
+        '--unit',
+        choices=LENGTHS,
+        help='of coordinates and their sigmas, where the file does not say (default m)',
     )
     add_force_option(convert)
     convert.set_defaults(run=_convert)
@@ -89,7 +97,7 @@ def _convert(args: argparse.Namespace) -> None:
     check_inputs_are_kept({'OUT.yaml': args.output}, {'what is converted': [args.file]})
     check_outputs([args.output], args.force)
     landmark_map = import_map(
-        args.file, args.frame, args.sigma, args.orientation_sigma, args.tag_axes
+        args.file, args.frame, args.sigma, args.orientation_sigma, args.tag_axes, args.unit
     )
     write_map(args.output, landmark_map, None)
     low, high = landmark_map.world_points.min(axis=0), landmark_map.world_points.max(axis=0)

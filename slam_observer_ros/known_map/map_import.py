@@ -1,6 +1,6 @@
-"""Maps of other programs: tables, TagSLAM's bodies, bundles of apriltag_ros, FRC's fields.
+"""Maps of other programs: tables, TagSLAM's bodies, bundles, FRC's fields, scanners' landmarks.
 
-In all of them but the last the axes of a tag are, seen from before the upright tag: x to the
+In all of them but FRC's the axes of a tag are, seen from before the upright tag: x to the
 right, y up, z out of it. So TagSLAM and apriltag_ros have them, and AprilTags are upright as their
 makers print them.
 """
@@ -31,8 +31,10 @@ from slam_observer_ros.known_map.map_tables import (
     QUATERNION,
     reason,
     Row,
+    scanner_rows,
     table_rows,
     turned,
+    UNITS,
     UNKNOWN_NOISE,
 )
 
@@ -48,6 +50,13 @@ TAG_AXES: Mapping[str, Sequence[float]] = {
 }
 """The axes x, y, z that detectors give a tag, along those in the files; ``none`` for points."""
 
+LENGTHS = ('m', 'cm', 'mm')
+"""Units of coordinates."""
+
+WIDE_M, SPARSE_M = 1000.0, 100.0
+"""Extent of a map, and distance of half of its landmarks to the nearest other, from which on both
+its coordinates are hardly in metres: no sensor sees two of them at once."""
+
 MAX_NAMED = 12
 """Of what is left out, as many are named in one line."""
 
@@ -60,12 +69,15 @@ def import_map(
     sigma_m: float,
     orientation_sigma_rad: float,
     tag_axes: str = 'right-up-out',
+    unit: str | None = None,
 ) -> LandmarkMap:
     """Read a map in one of the formats; the sigmas are for landmarks that have none.
 
-    Orientations are from ``tag_axes``, one of :data:`TAG_AXES`. What is left out is logged. Raise
-    :exc:`MapError` if it can't be read, is in none of the formats, or has a value that can't be
-    right; the message names the file, the line or tag, and the reason.
+    Coordinates and their sigmas are in ``unit``, one of :data:`LENGTHS`, where the file does not
+    say; by default metres, unless these look like millimetres. Orientations are from ``tag_axes``,
+    one of :data:`TAG_AXES`. What is left out is logged. Raise :exc:`MapError` if it can't be read,
+    is in none of the formats, or has a value that can't be right; the message names the file, the
+    line or tag, and the reason.
     """
     left_out: list[str] = []
     try:
@@ -85,6 +97,10 @@ def import_map(
     if not rows:
         raise MapError(f'{path}: there are no landmarks in it')
     _check_ids(path, rows)
+    if unit is None:
+        _check_unit(path, rows)
+    elif UNITS[unit] != 1.0:
+        rows = [_scaled(row, UNITS[unit]) for row in rows]
     return _as_map(rows, frame_id, sigma_m, orientation_sigma_rad, np.array(TAG_AXES[tag_axes]))
 
 
@@ -94,9 +110,29 @@ def _rows(path: Path, left_out: list[str]) -> list[Row]:
     suffix = path.suffix.lower()
     if suffix in ('.csv', '.txt', '.tsv'):
         return table_rows(path, left_out)
+    if suffix in ('.imk', '.lmk'):
+        return scanner_rows(path)
     if suffix == '.json':
         return _field_rows(json.loads(read_text(path)))
     return _yaml_rows(path, left_out)
+
+
+def _check_unit(path: Path, rows: Sequence[Row]) -> None:
+    """Ask what unit coordinates are in that look like millimetres."""
+    points = np.array([row.position for row in rows])
+    extent_m = float(np.ptp(points, axis=0).max())
+    if extent_m < WIDE_M or len(rows) < 2:
+        return
+    off_m = np.linalg.norm(points[:, None] - points, axis=2) + np.diag(np.full(len(rows), np.inf))
+    if np.median(off_m.min(axis=1)) > SPARSE_M:
+        raise MapError(
+            f'{path}: the landmarks are {extent_m / 1000.0:.1f} km apart: are these millimetres? '
+            "Give --unit mm, or --unit m if they are right; a table's columns may say it: 'x [mm]'"
+        )
+
+
+def _scaled(row: Row, scale: float) -> Row:
+    return row._replace(position=scale * row.position, covariance=scale**2 * row.covariance)
 
 
 def _yaml_rows(path: Path, left_out: list[str]) -> list[Row]:

@@ -1,6 +1,6 @@
 """Maps of other programs: a landmark as they write it, and tables of these.
 
-Tables are those of people and spreadsheets, and fiducial_slam's map.txt.
+Tables are of people and spreadsheets, fiducial_slam's map.txt, and navigation scanners'.
 """
 
 from __future__ import annotations
@@ -306,3 +306,19 @@ def _fiducial_slam_row(number: int, cells: Sequence[str]) -> Row:
             raise MapError('the variance is negative')
         covariance = np.diag([variance] * 3)
         return Row(int(cells[0]), pose[:3, 3], pose[:3, :3], covariance)
+
+
+def scanner_rows(path: Path) -> list[Row]:
+    """Read the landmark file of a navigation scanner: id, x and y in mm, and what it is.
+
+    Type, subtype, size and layer, which may follow, say nothing of the place. Raises a MapError
+    that names the line if it can't be right.
+    """
+    rows = []
+    for number, cells in _cells(read_text(path)):
+        with naming(f'line {number}'):
+            if len(cells) < 3 or not all(map(_is_number, cells)):
+                raise MapError('it is not laid out as: globID x/mm y/mm type subtype size layerID')
+            mm = UNITS['mm']
+            rows.append(_row({'id': (cells[0], 1.0), 'x': (cells[1], mm), 'y': (cells[2], mm)}))
+    return rows

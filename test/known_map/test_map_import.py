@@ -359,3 +359,52 @@ def test_what_can_not_be_read_is_refused_with_the_reason(load, text, name, reaso
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(MapError, match=r"can't read .*none\.csv"):
         import_map(tmp_path / 'none.csv', 'map', 0.02, 0.03)
+
+
+SCANNER = """# globID x/mm y/mm type subtype size/mm layerID
+1 5300 -2300 1 2 90 1
+2\t-5100\t6600\t1\t2\t90\t1
+
+7 2300 -10200 1 2 90 1
+"""
+
+
+@pytest.mark.parametrize('suffix', ['imk', 'lmk', 'LMK'])
+def test_the_landmark_file_of_a_navigation_scanner_is_in_millimetres(load, suffix):
+    found = load(SCANNER, f'layout.{suffix}')
+    assert found.ids.tolist() == [1, 2, 7]
+    assert_allclose(found.world_points[:, :2], [[5.3, -2.3], [-5.1, 6.6], [2.3, -10.2]])
+    assert_allclose(np.sqrt(np.diagonal(found.covariances[0])), [0.02, 0.02, 10.0])
+
+
+@pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        ('1 5300\n', 'line 1: it is not laid out as: globID'),
+        ('1 5300 north 1\n', 'line 1: it is not laid out as: globID'),
+        ('1.5 5300 2 1\n', "line 1: the id '1.5' is no whole number"),
+        ('1 nan 2 1\n', 'line 1: x is'),
+        ('1 2 3\n1 3 4\n', 'more than once|twice'),
+    ],
+)
+def test_a_scanners_file_that_is_none_is_refused(load, text, reason):
+    with pytest.raises(MapError, match=reason):
+        load(text, 'layout.imk')
+
+
+def test_a_survey_that_looks_like_millimetres_is_asked_about(tmp_path):
+    path = tmp_path / 'hall.csv'
+    path.write_text('id,x,y,z,sigma\n1,5300,-2300,0,20\n2,-5100,6600,0,20\n3,2300,-10200,0,20\n')
+    with pytest.raises(MapError, match=r'16\.8 km apart: are these millimetres\? Give --unit mm'):
+        import_map(path, 'map', 0.02, 0.03)
+    found = import_map(path, 'map', 0.02, 0.03, unit='mm')
+    assert_allclose(found.world_points[0], [5.3, -2.3, 0.0])
+    assert_allclose(np.diagonal(found.covariances[0]), 0.02**2)
+    assert import_map(path, 'map', 0.02, 0.03, unit='m').world_points[0, 0] == 5300.0
+
+
+def test_a_large_site_whose_landmarks_are_close_to_each_other_is_in_metres(tmp_path):
+    path = tmp_path / 'site.csv'
+    rows = [f'{i},{40.0 * i},{7.0 * (i % 3)}' for i in range(60)]
+    path.write_text('\n'.join(['id,x,y', *rows]))
+    assert len(import_map(path, 'map', 0.02, 0.03).ids) == 60
