@@ -244,7 +244,8 @@ def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
         raise UsageError(f'nothing to smooth: no observation since {smoothed.since}')
     online = outcome.result.trajectory
     stamps_ns = online.stamps_ns
-    if len(smoothed.stamps_ns) < outcome.result.observations:
+    parked = outcome.result.estimator.counts['parked_observation']
+    if len(smoothed.stamps_ns) + parked < outcome.result.observations:
         stamps_ns = stamps_ns[stamps_ns >= smoothed.stamps_ns[0]]
         logger.warning(
             'Only the last %d observations are smoothed: those since %s.',

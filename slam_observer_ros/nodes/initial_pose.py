@@ -188,7 +188,7 @@ class KeptPose:
         age_s, motion = time.time() - stored.time_s, se3.inverse(then) @ now
         way_m = float(np.linalg.norm(motion[:3, 3]))
         if (_is_at_start(now) and not _is_at_start(then)) or way_m > FAST_M_PER_S * age_s:
-            self._logger.info('the odometry began anew: the robot is taken to be where it was')
+            self._logger.info('the odometry has begun again: the robot is where it was')
             return
         s = self._estimator.settings
         noise = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])

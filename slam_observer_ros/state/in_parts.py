@@ -18,7 +18,6 @@ from slam_observer_ros.state.matching import (
     enter,
     Expected,
     is_contradiction,
-    keep,
     keyframe_of,
     reject,
 )
@@ -83,7 +82,7 @@ def _in_parts(
         enter(state, new, state.observation_noise.covariances(new))
     past = state.relinearisation
     if past.is_active:
-        keep(state, keyframe_of(state, shown, state.landmarks.rows_of(event.ids)))
+        state.keep(keyframe_of(state, shown, state.landmarks.rows_of(event.ids)))
     expected = None if of_used is None else usual.expected(state, of_used.out)
     return _update(state, event, known, rejected[known], of_all, of_used), expected
 

@@ -138,21 +138,6 @@ def keyframe_of(
     )
 
 
-OLD_NEWS = 10.0
-"""By what factor covariances of views have grown, while a robot stands, that are not kept."""
-
-
-def keep(state: State, keyframe: Keyframe, in_doubt: bool = False) -> None:
-    """Keep an observation to be linearised again, but none that a parked robot makes for hours.
-
-    They would say nothing more, and take the place of those of the drive.
-    """
-    stands = state.observation_noise.stood_s > 0.0
-    if stands and not in_doubt and keyframe.repeated.min(initial=np.inf) > OLD_NEWS:
-        return
-    state.relinearisation.add(keyframe, in_doubt)
-
-
 def reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray) -> None:
     """Count points (m,) that were rejected, off by r (m, 3), against their landmarks.
 

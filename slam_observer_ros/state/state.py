@@ -20,8 +20,12 @@ from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
 from slam_observer_ros.state import covariances
+
+OLD_NEWS = 10.0
+"""By what factor covariances of views have grown, while a robot stands, that are not kept."""
 
 
 class State:
@@ -239,6 +243,17 @@ class State:
         self.gains.fix_landmarks(known)
         self.landmark_velocity_stddev = 0.0
         self.relinearisation = Past()  # there is no drift to undo
+
+    def keep(self, keyframe: Keyframe, in_doubt: bool = False) -> None:
+        """Keep an observation to be linearised again, but none more of a robot that is parked.
+
+        They would say nothing more, and take the place of those of the drive.
+        """
+        stands = self.observation_noise.stood_s > 0.0
+        if stands and not in_doubt and keyframe.repeated.min(initial=np.inf) > OLD_NEWS:
+            self.counts['parked_observation'] += 1
+        else:
+            self.relinearisation.add(keyframe, in_doubt)
 
     def smooth(self) -> Smoothed:
         """Return the smoothed trajectory and map; see :meth:`.Relinearisation.smooth`."""

@@ -22,7 +22,6 @@ from slam_observer_ros.state.matching import (
     enter,
     Expected,
     is_contradiction,
-    keep,
     keyframe_of,
     mapped,
     MatchedObservation,
@@ -86,7 +85,7 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
     past = state.relinearisation
     if past.is_active:
         turns = seen_orientations(state, event, rows)
-        keep(state, keyframe_of(state, event, rows, turns), some_are)
+        state.keep(keyframe_of(state, event, rows, turns), some_are)
     if some_are:
         return _relocate_moved(state, event.select(in_doubt), rows[in_doubt])
     return np.empty(0, dtype=np.int64)

@@ -36,7 +36,7 @@ from slam_observer_ros.sensor_models.velocity_history import Velocities, Velocit
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.covariances import of_pose
-from slam_observer_ros.state.matching import Expected, keep
+from slam_observer_ros.state.matching import Expected
 from slam_observer_ros.state.state import State
 
 MOST_WORK = 1e7
@@ -137,7 +137,7 @@ def finish(state: State, event: ObservationEvent, corrected: Corrected) -> Updat
     """
     past, out = state.relinearisation, corrected.out
     if past.is_active:
-        keep(state, keyframe(state, event, corrected))
+        state.keep(keyframe(state, event, corrected))
     none_rejected = np.zeros(len(event.ids), dtype=np.bool_)
     judged = innovation(state, out)
     return state.update(event.stamp_ns, event.ids, out.r, none_rejected, NO_IDS, judged)
