@@ -17,16 +17,20 @@ from typing import Any
 import numpy as np
 
 from slam_observer_ros.cli.console import print_json, print_table
-from slam_observer_ros.cli.options import named_path
+from slam_observer_ros.cli.options import find_config, named_path
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import Event, VelocityEvent
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.observer import core
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.mistakes import mistakes
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import message_types
+from slam_observer_ros.settings.parameter_file import read_parameter_file
+from slam_observer_ros.settings.parameter_table import from_parameters, table
 
 LISTENER = 'slam_observer_ros.nodes.live_inputs'
 """The program that hears topics; it is one of its own, as only ``nodes/`` knows ROS."""
@@ -53,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'Say which Python, ROS and packages are found, and which topics with velocities or '
         'landmarks are alive. Topics are heard for some seconds, in the ROS domain of this shell. '
         'Of a recording, say which of the parameter files that come with the package fits it, and '
-        'why.'
+        'why, and which mistake of the set-up (signs, units, frames) explains it better.'
     )
     parser.add_argument(
         'recording', nargs='?', type=named_path, metavar='RECORDING', help='as replay takes it'
@@ -70,11 +74,22 @@ def run(args: argparse.Namespace) -> None:
     if not 0.0 < args.seconds <= 3600.0:
         raise UsageError(f'--seconds takes seconds above 0, up to 3600, not {args.seconds:g}')
     if args.recording is not None:
-        name, why = fitting_file(args.recording)
+        name, why, events = fitting_file(args.recording)
+        findings = mistakes(_shipped_settings(name), events)
         if args.json:
-            print_json({'recording': str(args.recording), 'config': name, 'why': why})
+            print_json(
+                {
+                    'recording': str(args.recording),
+                    'config': name,
+                    'why': why,
+                    'findings': [finding.as_json() for finding in findings],
+                }
+            )
             return
-        print_table(str(args.recording), {'fits': f'--config {name}', 'because': why})
+        rows = {'fits': f'--config {name}', 'because': why}
+        named = ', or '.join(f'{finding.what}: {finding.remedy}' for finding in findings)
+        rows['mistakes of the set-up'] = named or 'none found'
+        print_table(str(args.recording), rows)
         return
     installed = _installed()
     has_ros = find_spec('rclpy') is not None
@@ -147,7 +162,7 @@ def _topics(seconds: float) -> list[dict[str, Any]]:
     return heard
 
 
-MOST_EVENTS = 20_000
+MOST_EVENTS = 60_000
 """Events of a recording that are looked at, from its start."""
 
 OUT_OF_PLANE = 0.1
@@ -157,15 +172,29 @@ REPEATED = 0.5
 """Share of the velocities that are exactly the one before beyond which they are commands."""
 
 
-def fitting_file(path: Path) -> tuple[str, str]:
-    """Return the name of a shipped parameter file, and in words why it fits a recording."""
+def _shipped_settings(name: str) -> Settings:
+    """Return what a shipped parameter file says of the estimator."""
+    known = {row.name for row in table(Settings)}
+    values = read_parameter_file(find_config(name)).items()
+    return from_parameters(Settings, {key: value for key, value in values if key in known})
+
+
+def fitting_file(path: Path) -> tuple[str, str, list[Event]]:
+    """Return the name of a shipped parameter file, and in words why it fits a recording.
+
+    And the events of the recording's beginning.
+    """
     with Recording(path) as recording:
         selected = recording.find_topics()
         kind = selected.landmarks.message_type
-        events = islice(recording.events(selected), MOST_EVENTS)
+        events = list(islice(recording.events(selected), MOST_EVENTS))
         velocities = np.array(
             [event.body_velocity for event in events if isinstance(event, VelocityEvent)]
         ).reshape(-1, 6)
+    return *_fitting(kind, velocities), events
+
+
+def _fitting(kind: str, velocities: FloatArray) -> tuple[str, str]:
     flat = _is_flat(velocities)
     where = 'the robot stays on a floor' if flat else 'it tilts or climbs: two_d_mode: false'
     if kind == TRANSFORMS:

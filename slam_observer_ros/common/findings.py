@@ -77,6 +77,52 @@ KINDS = {
         'no landmark in {count} messages so far',
         'are there any in view, and is the detector set up for them?',
     ),
+    # Mistakes of the set-up (runs/mistakes.py)
+    'points_in_optical_axes': Kind(
+        Level.ERROR,
+        "the points are in a camera's axes, z forward, and their frame has a robot's, x forward",
+        'give the sensor an optical frame in /tf, or end sensor_pose by -1.5708, 0.0, -1.5708',
+    ),
+    'points_mirrored': Kind(
+        Level.ERROR,
+        'the y of the points is negated: left and right are exchanged',
+        'see what the detector publishes, or whether it is turning that is negated',
+    ),
+    'points_backwards': Kind(
+        Level.ERROR,
+        'the sensor looks backwards: it is mounted turned by 180° about z',
+        'state so in /tf, or end sensor_pose by 0.0, 0.0, 3.1416',
+    ),
+    'points_in_millimetres': Kind(
+        Level.ERROR, 'the points are in millimetres', 'let the detector publish metres (REP 103)'
+    ),
+    'tag_size': Kind(
+        Level.ERROR,
+        'by the wheels ranges are {factor:.2g} times as long as they are measured: the size of '
+        'the tags is stated wrong by that factor, or the radius of the wheels',
+        "see which: measure a tag's edge, or drive a metre; a survey decides as well",
+    ),
+    'turning_in_degrees': Kind(
+        Level.ERROR, 'the angular velocity is in degrees', 'let the driver publish rad/s (REP 103)'
+    ),
+    'speed_in_kmh': Kind(
+        Level.ERROR, 'the speed is in km/h', 'let the driver publish m/s (REP 103)'
+    ),
+    'turning_negated': Kind(
+        Level.ERROR,
+        'the angular velocity is negated: to the left is positive (REP 103)',
+        'see the signs of the driver, or whether it is the y of the points that is negated',
+    ),
+    'driving_negated': Kind(
+        Level.ERROR,
+        'the speed is negated: forward is positive (REP 103)',
+        'see the signs of the driver, or how its frame is turned',
+    ),
+    'no_turning': Kind(
+        Level.ERROR,
+        'the angular velocity is always zero, but the robot turns',
+        'see whether the driver fills it in, or set use_imu for the one of an IMU',
+    ),
     # Times of the inputs
     'silence': Kind(
         Level.WARNING,
