@@ -82,6 +82,8 @@ class VelocityHistory:
         self._periods, self._angular_periods = _Periods(), _Periods()
         self._zero_since_ns: int | None = None  # since when the velocity has been exactly zero
         self._last_zero_ns = NEVER_NS
+        # Who has no odometry may publish zeros, and state how the robot may move as their noise.
+        self._has_moved = False
         self._stands = False
 
     def append(self, measured: MeasuredVelocity) -> bool:
@@ -103,7 +105,7 @@ class VelocityHistory:
             first, one, usual_s = self._new_row(1), measured, self._took(measured)
             self._joined.write(first, one.stamp_ns, one.body_velocity, one.covariance, usual_s)
             if any(one.body_velocity.tolist()):
-                self._zero_since_ns, self._stands = None, False
+                self._zero_since_ns, self._stands, self._has_moved = None, False, True
             else:
                 stand = [first] * self._note_zero(one.stamp_ns)
         else:
@@ -115,7 +117,7 @@ class VelocityHistory:
             move = np.asarray(many.body_velocities.any(axis=1)).tolist()
             for row, stamp_ns in enumerate(many.stamps_ns.tolist(), first):
                 if move[row - first]:
-                    self._zero_since_ns, self._stands = None, False
+                    self._zero_since_ns, self._stands, self._has_moved = None, False, True
                 elif self._note_zero(stamp_ns):
                     stand.append(row)
         if (angular := self._angular) is not None:
@@ -134,7 +136,7 @@ class VelocityHistory:
         if since_ns is None or stamp_ns > self._last_zero_ns + self._timeout_ns:
             self._zero_since_ns = since_ns = stamp_ns
         self._last_zero_ns = stamp_ns
-        self._stands = stamp_ns >= since_ns + STANDS_NS
+        self._stands = self._has_moved and stamp_ns >= since_ns + STANDS_NS
         return self._stands
 
     def _let_stand(self, rows: IntArray) -> None:

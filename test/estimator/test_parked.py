@@ -106,8 +106,16 @@ def test_standing_begins_after_a_second_of_zeros_and_ends_at_once():
     assert variances(history, PERIOD_NS, 10 * PERIOD_NS) == (False, 0.0)
 
 
+def test_who_has_no_odometry_and_publishes_zeros_does_not_stand():
+    history = VelocityHistory(SECOND)
+    for step in range(100):
+        history.append(VelocityEvent(step * PERIOD_NS, np.zeros(6)))
+        assert history.stood_s(step * PERIOD_NS) == 0.0
+
+
 def test_a_driver_that_falls_silent_does_not_stand():
     history = VelocityHistory(SECOND // 2)
+    history.append(VelocityEvent(-SECOND, V))
     for stamp_ns in (0, SECOND // 4, 5 * SECOND, 5 * SECOND + SECOND // 4):
         history.append(VelocityEvent(stamp_ns, np.zeros(6)))
         assert history.stood_s(stamp_ns) == 0.0
@@ -128,7 +136,8 @@ def test_velocities_in_a_block_stand_as_single_ones_do():
 @pytest.mark.parametrize(('rate', 'stands'), [(0.5 * TURNS, True), (2.0 * TURNS, False)])
 def test_wheels_that_stand_overrule_the_bias_of_a_gyroscope_but_not_a_turn(rate, stands):
     history, turns = VelocityHistory(SECOND), np.array([0.0, 0.0, rate])
-    for step in range(60):
+    history.append(VelocityEvent(0, V))
+    for step in range(1, 60):
         history.append(VelocityEvent(step * PERIOD_NS, np.zeros(6)))
         history.append(AngularVelocityEvent(step * PERIOD_NS + 1, turns))
     stamp_ns = 60 * PERIOD_NS
