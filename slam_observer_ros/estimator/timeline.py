@@ -168,10 +168,14 @@ class Timeline:
         return event
 
     def judge_standing(self, event: ObservationEvent, update: Update) -> None:
-        """Doubt that the robot stands where all that it sees is rejected, and far off."""
-        rejects_all = len(update.rejected) > 0 and bool(update.rejected.all())
-        seen = event.points[np.isin(event.ids, update.ids)]
-        if rejects_all and beyond_driving(seen, update.residuals, self._settings).all():
+        """Doubt that the robot stands where all that it sees is rejected, and far off.
+
+        Far as the farthest point is seen: points without ids have other ids in ``update``.
+        """
+        if not len(update.rejected) or not update.rejected.all():
+            return
+        farthest = event.points[np.argmax(np.linalg.norm(event.points, axis=1))][None]
+        if beyond_driving(farthest, update.residuals, self._settings).all():
             self.velocities.doubt_standing()
 
     def knows_motion_since(self, stamp_ns: int) -> bool:

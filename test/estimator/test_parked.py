@@ -11,6 +11,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     ObservationEvent,
+    UNKNOWN_ID,
     VelocityBlock,
     VelocityEvent,
 )
@@ -33,7 +34,7 @@ class Robot:
         self.estimator, self.rng = Estimator(settings), np.random.default_rng(0)
         self.A, self.stamp_ns = np.eye(4), 0
 
-    def run(self, seconds, rows, V=V, pushed=None, wander=0.0):
+    def run(self, seconds, rows, V=V, pushed=None, wander=0.0, ids=None):
         """Go on for some time, seeing landmarks ``rows`` ten times a second."""
         for step in range(round(seconds * SECOND / PERIOD_NS)):
             self.estimator.add(VelocityEvent(self.stamp_ns, V))
@@ -42,7 +43,8 @@ class Robot:
             if len(rows) and step % 2:
                 seen = se3.transform(se3.inverse(self.A), POINTS[rows])
                 seen += wander + 0.01 * self.rng.normal(size=seen.shape)
-                self.estimator.add(ObservationEvent(self.stamp_ns, np.array(rows), seen))
+                named = np.array(rows) if ids is None else ids
+                self.estimator.add(ObservationEvent(self.stamp_ns, named, seen))
         self.estimator.flush()
 
     @property
@@ -91,6 +93,21 @@ def test_a_robot_that_is_pushed_with_its_wheels_locked_is_noticed(rows):
 def variances(history, start_ns, end_ns):
     held = history.held(start_ns, end_ns)
     return held.is_stated.all(), np.diagonal(held.covariances, axis1=1, axis2=2).max()
+
+
+@pytest.mark.parametrize('named', [0, 2, 4])
+def test_rejected_points_without_ids_end_standing_as_others_do(named):
+    robot, ids = Robot(), np.where(np.arange(4) < named, np.arange(4), UNKNOWN_ID)
+    robot.run(10.0, [0, 1, 2, 3], ids=ids)
+    robot.run(3.0, [0, 1, 2, 3], np.zeros(6), ids=ids)
+    timeline, update = robot.estimator._timeline, robot.estimator.last_update
+    assert timeline.velocities.stood_s(robot.stamp_ns) > 1.0
+    none, all_ = np.zeros(4, dtype=bool), np.ones(4, dtype=bool)
+    event = ObservationEvent(robot.stamp_ns, ids, POINTS)
+    for rejected, off_m, stands in ((none, 5.0, True), (all_, 0.0, True), (all_, 5.0, False)):
+        residuals = np.full((4, 3), off_m)
+        timeline.judge_standing(event, replace(update, rejected=rejected, residuals=residuals))
+        assert (timeline.velocities.stood_s(robot.stamp_ns) > 0.0) == stands
 
 
 def test_standing_begins_after_a_second_of_zeros_and_ends_at_once():
