@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import logging
 import math
@@ -36,6 +36,7 @@ from slam_observer_ros.runs.health import (
     of_rejections,
 )
 from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
+from slam_observer_ros.runs.mistakes import explained, SUSPICIOUS
 from slam_observer_ros.runs.reported_run import NisTally, Replay, ReportedRun, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -186,6 +187,7 @@ def judged(
     inputs: InputSettings,
     unused: Sequence[Finding],
     map_path: Path | None,
+    look_for_mistakes: Callable[[], Sequence[Finding]],
 ) -> ReplayOutcome:
     """Add what is wrong, and log warnings; ``unused`` is of inputs of which nothing was used."""
     result, selected = outcome.result, outcome.selected
@@ -197,6 +199,8 @@ def judged(
         *of_timing(recording, selected),
         *(of_errors(outcome.whole_run) if outcome.whole_run is not None else ()),
     ]
+    if result.estimator.counts['slip'] or any(each.kind in SUSPICIOUS for each in findings):
+        findings = explained([*look_for_mistakes(), *findings])
     findings.sort(key=lambda finding: -finding.level)
     for finding in findings:
         if finding.level >= Level.WARNING:
@@ -207,7 +211,7 @@ def judged(
 def with_logged(outcome: ReplayOutcome, logged: Sequence[Finding | str]) -> ReplayOutcome:
     """Add what was logged on the way: findings, and other warnings."""
     others = [one for one in logged if isinstance(one, Finding) and one not in outcome.findings]
-    findings = sorted([*outcome.findings, *others], key=lambda finding: -finding.level)
+    findings = sorted(explained([*outcome.findings, *others]), key=lambda each: -each.level)
     return replace(outcome, findings=findings, warnings=[str(one) for one in logged])
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slam_observer_ros.cli.console import show_progress
+from slam_observer_ros.cli.console import muted_warnings, show_progress
 from slam_observer_ros.cli.replay_outcome import judged, outcome_of, ReplayOutcome, with_smoothed
 from slam_observer_ros.cli.replay_request import Records, ReplayRequest, select_inputs
 from slam_observer_ros.common.errors import UsageError
@@ -20,6 +21,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.input_health import of_use
+from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.runs.reported_run import NisTally, Replay, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -69,13 +71,27 @@ def _replay(
             result = replay(events, settings, truth, maps or None, needs_poses, recorders)
             unused = list(of_use(recording, selected, inputs, result))
             _check_used(request, unused)
-            if maps:
-                _check_localised(request, result, maps)
+            look_for_mistakes = partial(_mistakes, request, selected, inputs, maps)
+            if maps and not result.estimator.is_localised:
+                _check_localised(request, result, maps, look_for_mistakes)
             outcome = outcome_of(recording, selected, result, truth, recorder)
             if writer is not None:
                 writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
-        outcome = judged(outcome, recording, inputs, unused, request.load_map)
+        outcome = judged(outcome, recording, inputs, unused, request.load_map, look_for_mistakes)
     return with_smoothed(outcome) if request.smooth else outcome
+
+
+def _mistakes(
+    request: ReplayRequest,
+    selected: SelectedTopics,
+    inputs: InputSettings,
+    maps: Sequence[LandmarkMap],
+) -> list[Finding]:
+    """Look whether a mistake of the set-up explains a recording, which is read again for that."""
+    settings = request.settings
+    with muted_warnings(), Recording(request.recording) as recording:
+        events = recording.events(selected, inputs, settings.velocity_timeout)
+        return mistakes(settings, events, maps or None)
 
 
 def _recorder(records: Records) -> RunRecorder | NisTally | None:
@@ -108,17 +124,22 @@ def _check_used(request: ReplayRequest, use: list[Finding]) -> None:
             )
 
 
-def _check_localised(request: ReplayRequest, result: Replay, maps: Sequence[LandmarkMap]) -> None:
+def _check_localised(
+    request: ReplayRequest,
+    result: Replay,
+    maps: Sequence[LandmarkMap],
+    look_for_mistakes: Callable[[], Sequence[Finding]],
+) -> None:
     """Refuse an outcome that is not in the frame of the map that was loaded.
 
     Where the pose in it was found and lost again the trajectory is still of use, but not the map:
     a UsageError says if the pose was never found, or not at the end and the map is asked for.
     """
-    if result.estimator.is_localised:
-        return
     if result.localised_ns is None:
+        why = '; '.join(str(mistake) for mistake in look_for_mistakes())
         raise UsageError(
-            f'the pose in the map {request.load_map} was not found: {_never_found(result, maps)}'
+            f'the pose in the map {request.load_map} was not found: '
+            f'{why or _never_found(result, maps)}'
         )
     if request.records.map or request.smooth:
         end_s = result.seconds_until(result.localised_ns[1])

@@ -98,9 +98,10 @@ KINDS = {
     ),
     'tag_size': Kind(
         Level.ERROR,
-        'by the wheels ranges are {factor:.2g} times as long as they are measured: the size of '
-        'the tags is stated wrong by that factor, or the radius of the wheels',
-        "see which: measure a tag's edge, or drive a metre; a survey decides as well",
+        'by {by} ranges are {factor:.2f} times as long as they are measured: the size of the tags '
+        'is stated wrong by that factor, or what else gives the distance (a map decides whether '
+        'the radius of the wheels does)',
+        "see which: measure a tag's edge, or drive a metre",
     ),
     'turning_in_degrees': Kind(
         Level.ERROR, 'the angular velocity is in degrees', 'let the driver publish rad/s (REP 103)'

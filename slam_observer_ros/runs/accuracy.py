@@ -263,7 +263,7 @@ class LikelihoodRecorder:
 
     def __init__(self, dimension: int, reach_m: float) -> None:
         ball = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1) * reach_m**dimension
-        self._log_outlier = math.log(OUTLIERS / ball)
+        self.log_outlier = math.log(OUTLIERS / ball)
         self.clear()
 
     def clear(self) -> None:
@@ -278,7 +278,7 @@ class LikelihoodRecorder:
         if innovation is None:
             return
         regular = math.log1p(-OUTLIERS) + innovation.log_densities
-        self._log_densities.append(np.logaddexp(regular, self._log_outlier))
+        self._log_densities.append(np.logaddexp(regular, self.log_outlier))
         self._shares.append(innovation.shares)
         self._stamps_ns += [update.stamp_ns] * len(regular)
 

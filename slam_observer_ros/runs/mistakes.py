@@ -8,16 +8,20 @@ unit of what was recorded, k being 2 in the plane and 3 in space.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 import logging
 import math
+import time
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -26,11 +30,15 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.runs.accuracy import LikelihoodRecorder
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
+
+Maps: TypeAlias = LandmarkMap | Sequence[LandmarkMap]
+Result = TypeVar('Result')
 
 DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
 """Time of driving, and turns, that are looked at: who stands or goes straight on says little."""
@@ -41,8 +49,8 @@ MOST_S = 300.0
 SURE, CLEAR = 15.0, 0.1
 """ln of how many times likelier all points must be, and each on average."""
 
-NOTABLE_TURN = 2.0
-"""Times the stated noise of turning that a robot which turns without saying so shows at least."""
+NOTABLE_TURN_RAD = 1.0
+"""Turn, by what is seen, that a robot which turns without saying so shows at least."""
 
 _IDENTITY = np.eye(3)
 
@@ -55,6 +63,23 @@ class Correction:
     points: FloatArray = field(default_factory=lambda: _IDENTITY)  # (3, 3), times each point
     turn: float = 1.0  # times the angular velocity
     drive: float = 1.0  # times the linear velocity
+    changes: Mapping[str, Any] = field(default_factory=dict)  # of settings, while it is judged
+    parts: tuple[Correction, ...] = ()  # of a pair of mistakes
+
+    def goes_with(self, other: Correction) -> bool:
+        """Return whether both can be of one set-up, and are not the same as a single one."""
+        kinds = {self.kind, other.kind}
+        return len(kinds) == 2 and kinds not in ALIKE
+
+    def and_then(self, other: Correction) -> Correction:
+        """Return the correction of both mistakes."""
+        return Correction(
+            '',
+            other.points @ self.points,
+            self.turn * other.turn,
+            self.drive * other.drive,
+            parts=(self, other),
+        )
 
     def apply(
         self, events: Iterable[Event], noise: ObservationNoise | None = None
@@ -90,75 +115,226 @@ class Correction:
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """From a camera's axes, z forward and x to the right, to a robot's."""
 
-AS_IT_IS = Correction('')
+IN_DEGREES = math.radians(1.0)
+
+SIZED = {'linear_scale_stddev': (0.0, 0.0, 0.0)}
+"""A wheel's scale that is estimated would make up for the size of tags."""
+
+AS_IT_IS, AS_SIZED = Correction(''), Correction('', changes=SIZED)
 
 CORRECTIONS = (
     Correction('points_in_optical_axes', OPTICAL),
     Correction('points_mirrored', np.diag([1.0, -1.0, 1.0])),
     Correction('points_backwards', np.diag([-1.0, -1.0, 1.0])),
     Correction('points_in_millimetres', 1e-3 * _IDENTITY),
-    *(Correction('tag_size', s * _IDENTITY) for s in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)),
-    Correction('turning_in_degrees', turn=math.radians(1.0)),
+    *(
+        Correction('tag_size', s * _IDENTITY, changes=SIZED)
+        for s in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
+    ),
+    Correction('turning_in_degrees', turn=IN_DEGREES),
     Correction('speed_in_kmh', drive=1.0 / 3.6),
     Correction('turning_negated', turn=-1.0),
     Correction('driving_negated', drive=-1.0),
 )
 
+MISTAKES = frozenset({'no_turning', *(each.kind for each in CORRECTIONS)})
+"""Kinds of finding that name a mistake of the set-up."""
+
 ALIKE = ({'points_mirrored', 'turning_negated'}, {'points_backwards', 'driving_negated'})
 """Mirror images of each other, and what differs by which end of the robot is its front."""
+
+PAIRS = tuple(
+    one.and_then(other)
+    for one, other in combinations([each for each in CORRECTIONS if not each.changes], 2)
+    if one.goes_with(other)
+)
+
+ROUGHLY = 0.2
+"""Deviation of a scale that is known to the next of the sizes that are tried."""
+
+EARLY, TRIED = 1.0 / 3.0, 3
+"""Part of the drive by which corrections are chosen that are tried on the whole, and how many."""
+
+SYMPTOMS = frozenset(
+    {
+        'rejected_points',
+        'left_out_points',
+        'unmapped_points',
+        'unknown_pose',
+        'no_place',
+        'lost_pose',
+        'wrong_pose',
+        'contradicted_pose',
+        'diverged',
+        'not_relinearised',
+        'slip',
+        'unexpected_place',
+        'moved_landmark',
+        'many_moved',
+        'carried_landmark',
+        'late_odometry',
+        'implausible_calibration',
+        'mounting',
+        'range_scale',
+        'depth_for_range',
+        'noisy_odometry',
+        'axis_noise',
+        'motion_noise',
+        'point_noise',
+        'small_noise',
+        'large_noise',
+        'overconfident_pose',
+        'error_growth',
+    }
+)
+"""Findings that a mistake of the set-up may cause, and whose remedies would then be untrue."""
+
+SUSPICIOUS = SYMPTOMS - {'large_noise', 'error_growth', 'axis_noise', 'left_out_points'}
+"""Those of them that are reason to look for one."""
+
+
+def explained(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings without those that a mistake of the set-up which is among them explains."""
+    findings = list(findings)
+    names_one = any(each.kind in MISTAKES for each in findings)
+    return [each for each in findings if not names_one or each.kind not in SYMPTOMS]
+
 
 LEAST_TURN_RAD = 1.0
 """Turn in all that must be left of an angular velocity which is taken for one in degrees."""
 
 
 def mistakes(
-    settings: Settings, events: Sequence[Event], known: LandmarkMap | None = None
+    settings: Settings, events: Iterable[Event], known: Maps | None = None
 ) -> list[Finding]:
-    """Name the mistake of the set-up that explains what was recorded; none if it is right.
+    """Name the mistakes of the set-up, two at most, that explain what was recorded; none if right.
 
-    Points without ids, whose meaning depends on the set-up, are left out. ``known`` is a map that
-    the robot was in.
+    Points without ids, whose meaning depends on the set-up, are left out. ``known`` are the maps
+    in one of which the robot was.
     """
-    log = logging.getLogger('slam_observer_ros')
-    level = log.level
-    log.setLevel(logging.CRITICAL)  # what is wrong with a trial is no news
-    try:
-        return _named(settings, first_drive(events), known)
-    finally:
-        log.setLevel(level)
+    search = Search(settings, events, known)
+    search.advance(math.inf)
+    return search.findings
+
+
+class Search:
+    """Looks for mistakes as :func:`mistakes` does, a part at a time, as a live node can't wait."""
+
+    def __init__(
+        self, settings: Settings, events: Iterable[Event], known: Maps | None = None
+    ) -> None:
+        self.findings: list[Finding] = []
+        trial = replace(
+            settings,
+            gains='riccati',
+            reorder_window=0.0,
+            use_tag_orientation=False,
+            max_hypotheses=1,
+            relinearization_interval=0,
+        )
+        self._steps = _named(trial, events, known)
+
+    def advance(self, seconds: float) -> bool:
+        """Go on for some time; return whether the end is reached, and ``findings`` are known."""
+        end_s = time.perf_counter() + seconds
+        log = logging.getLogger('slam_observer_ros')
+        level = log.level
+        log.setLevel(logging.CRITICAL)  # what is wrong with a trial is no news
+        try:
+            while time.perf_counter() < end_s:
+                next(self._steps)
+        except StopIteration as end:
+            self.findings = end.value
+            return True
+        finally:
+            log.setLevel(level)
+        return False
+
+
+Steps: TypeAlias = Generator[None, None, Result]
+"""What returns a result, and yields after each event that it has used."""
 
 
 def _named(
-    settings: Settings, events: Sequence[Event], known: LandmarkMap | None
-) -> list[Finding]:
-    seen = [event for event in events if isinstance(event, ObservationEvent)]
-    if not any(len(event.ids) for event in seen):
+    settings: Settings, recorded: Iterable[Event], known: Maps | None
+) -> Steps[list[Finding]]:
+    events = first_drive(recorded)
+    if not any(len(each.ids) for each in events if isinstance(each, ObservationEvent)):
         return []
-    reach = float(np.max([np.abs(event.points).max(initial=0.0) for event in seen]))
-    settings = replace(
-        settings,
-        gains='riccati',
-        reorder_window=0.0,
-        use_tag_orientation=False,
-        max_hypotheses=1,
-        relinearization_interval=0,
-    )
-    before = _Score(settings, events, AS_IT_IS, reach, known)
-    if never_turns(events) and before.turning_factor > NOTABLE_TURN:
+    before = yield from _score(settings, events, AS_IT_IS, known)
+    best = yield from _best(settings, events, before, CORRECTIONS, known)
+    if best is before:
+        # As with points in millimetres and in a camera's axes, where no single one helps.
+        best = (
+            before
+            if before.explains
+            else (yield from _best(settings, events, before, PAIRS, known))
+        )
+    if never_turns(events) and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
         return [found('no_turning')]
-    scores = [
-        _Score(settings, events, each, reach, known)
-        for each in CORRECTIONS
-        if each.kind != 'turning_in_degrees' or each.turn * turned(events) > LEAST_TURN_RAD
-    ]
-    better = [score for score in scores if score.is_clearly_better(before)]
-    if not better:
-        return []
-    best = max(better, key=lambda score: score.mean).correction
-    if best.kind == 'tag_size':
-        return [found('tag_size', factor=best.scale())]
-    kinds = next((alike for alike in ALIKE if best.kind in alike), {best.kind})
-    return [found(kind) for kind in sorted(kinds)]
+    if best is before or best.correction.parts:
+        return _findings(best.correction.parts, known)
+    first = best.correction
+    corrected, settings = list(first.apply(events)), replace(settings, **first.changes)
+    before = yield from _score(settings, corrected, AS_IT_IS, known)
+    others = [each for each in CORRECTIONS if first.goes_with(each)]
+    second = yield from _best(settings, corrected, before, others, known)
+    return _findings([first, *([] if second is before else [second.correction])], known)
+
+
+def _best(
+    settings: Settings,
+    events: Sequence[Event],
+    before: _Score,
+    corrections: Iterable[Correction],
+    known: Maps | None,
+) -> Steps[_Score]:
+    """Return how likely points are by the correction that makes them clearly the likeliest.
+
+    That is ``before`` where none does, the score of what was recorded.
+    """
+    early, tried = first_drive(events, EARLY), []
+    is_in_degrees = turned(events) * IN_DEGREES > LEAST_TURN_RAD
+    for each in corrections:
+        if each.kind != 'turning_in_degrees' or is_in_degrees:
+            tried.append((yield from _score(settings, early, each, known)))
+    tried.sort(key=lambda score: score.mean)
+    best = before
+    as_sized = yield from _score(settings, events, AS_SIZED, known)
+    for each in [score.correction for score in tried[-TRIED:]]:
+        score = yield from _score(settings, events, each, known)
+        is_better = score.is_clearly_better(as_sized if each.changes else before)
+        if is_better and score.mean > best.mean:
+            best = score
+    if best.correction.kind == 'tag_size':
+        sized = yield from _sized(settings, events, best.correction, known)
+        return replace(best, correction=sized)
+    return best
+
+
+def _sized(
+    settings: Settings, events: Sequence[Event], rough: Correction, known: Maps | None
+) -> Steps[Correction]:
+    """Return the correction of sizes by what a survey, or else the wheels, makes of ranges."""
+    by_survey = replace(rough, changes=SIZED | {'range_scale_stddev': ROUGHLY})
+    by_wheels = replace(rough, changes={'linear_scale_stddev': (ROUGHLY, 0.0, 0.0)})
+    judged = by_wheels if known is None else by_survey
+    score = yield from _score(settings, events, judged, known)
+    factor = 1.0 / score.scale if known is None else score.range_scale
+    return replace(rough, points=factor * rough.points)
+
+
+def _findings(corrections: Iterable[Correction], known: Maps | None) -> list[Finding]:
+    findings = []
+    for each in corrections:
+        if each.kind == 'tag_size':
+            by = 'the wheels' if known is None else 'the map'
+            findings.append(found('tag_size', factor=each.scale(), by=by))
+        else:
+            # What a map alone sets apart
+            alike = [kinds for kinds in ALIKE if each.kind in kinds and known is None]
+            findings += [found(kind) for kind in sorted(*alike or [{each.kind}])]
+    return findings
 
 
 def turned(events: Iterable[Event]) -> float:
@@ -173,14 +349,17 @@ def turned(events: Iterable[Event]) -> float:
     return total
 
 
-def first_drive(events: Sequence[Event]) -> list[Event]:
-    """Return the events until the robot has driven for DRIVE_S, with points that have ids."""
+def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
+    """Return the events until the robot has driven for DRIVE_S, with points that have ids.
+
+    Or until a ``part`` of that.
+    """
     kept: list[Event] = []
     driven_ns, turned_rad, last, first_ns = 0, 0.0, None, None
     for event in events:
         first_ns = event.stamp_ns if first_ns is None else first_ns
-        is_enough = driven_ns > to_ns(DRIVE_S) and turned_rad > TURNED_RAD
-        if is_enough or event.stamp_ns - first_ns > to_ns(MOST_S):
+        is_enough = driven_ns > part * to_ns(DRIVE_S) and turned_rad > part * TURNED_RAD
+        if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
             break
         if isinstance(event, ObservationEvent):
             kept.append(event.select(event.ids != UNKNOWN_ID))
@@ -208,35 +387,66 @@ def never_turns(events: Iterable[Event]) -> bool:
     return drives
 
 
+@dataclass(frozen=True, slots=True)
 class _Score:
-    """How likely points are, by what a filter expected of them that believes a correction."""
+    """How likely points are, by what a filter expected of them that believes a correction.
 
-    def __init__(
-        self,
-        settings: Settings,
-        events: Sequence[Event],
-        correction: Correction,
-        reach: float,
-        known: LandmarkMap | None,
-    ) -> None:
-        self.correction = correction
-        k, scale = axes_of(settings.two_d_mode).point, correction.scale()
-        recorder = LikelihoodRecorder(k, scale * reach)
-        estimator = Estimator(settings, on_update=recorder.note_update, judges_innovations=True)
-        if known is not None:
-            estimator.load_map(known)
-        keeps_noise = correction.kind == 'tag_size'
-        noise = ObservationNoise(settings) if keeps_noise else None
-        for event in correction.apply(events, noise):
-            estimator.add(event)
-        estimator.flush()
-        factors = {each.name: each.factor for each in estimator.motion_factors}
-        self.turning_factor = factors.get('turning', 1.0)
-        likelihood = recorder.likelihood
-        # ln of the density per unit of what was recorded, and of how many points with new errors
-        self.mean, self.weight = likelihood.mean + k * math.log(scale), likelihood.count
+    ``mean`` is the ln of the density per unit of what was recorded, of which ``outlier`` is what
+    a point anywhere in view has; ``weight`` says how many points with new errors there are.
+    """
+
+    correction: Correction
+    mean: float
+    weight: float
+    outlier: float
+    turned_rad: float  # at most since the start, as it is seen
+    scale: float  # of the wheels
+    range_scale: float
 
     def is_clearly_better(self, other: _Score) -> bool:
         """Return whether points are much likelier by this one."""
         gain = self.mean - other.mean
         return gain > CLEAR and gain * min(self.weight, other.weight) > SURE
+
+    @property
+    def explains(self) -> bool:
+        """Whether points are likelier than where they may be anywhere in view."""
+        return self.mean > self.outlier + 1.0
+
+
+def _score(
+    settings: Settings, events: Sequence[Event], correction: Correction, known: Maps | None
+) -> Steps[_Score]:
+    settings = replace(settings, **correction.changes)
+    k, scale = axes_of(settings.two_d_mode).point, correction.scale()
+    reach = max(
+        float(np.abs(each.points).max(initial=0.0))
+        for each in events
+        if isinstance(each, ObservationEvent)
+    )
+    recorder, attitudes = LikelihoodRecorder(k, scale * reach), [_IDENTITY]
+
+    def note_update(update: Update) -> None:
+        recorder.note_update(update)
+        attitudes.append(update.pose[:3, :3])
+
+    estimator = Estimator(settings, on_update=note_update, judges_innovations=True)
+    if known is not None:
+        estimator.load_map(known)
+    noise = ObservationNoise(settings) if correction.kind == 'tag_size' else None
+    for event in correction.apply(events, noise):
+        estimator.add(event)
+        yield
+    estimator.flush()
+    R = np.array(attitudes)
+    found_out = {each.name.partition('/')[0]: each.value for each in estimator.calibration}
+    likelihood, per_unit = recorder.likelihood, k * math.log(scale)
+    return _Score(
+        correction,
+        likelihood.mean + per_unit,
+        likelihood.count,
+        recorder.log_outlier + per_unit,
+        float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
+        found_out.get('linear_scale_x', 1.0),
+        found_out.get('range_scale', 1.0),
+    )
