@@ -93,12 +93,12 @@ class Correction:
         for event in events:
             if isinstance(event, ObservationEvent):
                 covariances = event.covariances if noise is None else noise.covariances(event)
-                if covariances is not None:
-                    covariances = self.points @ covariances @ self.points.T
+                M = self.points_seen_along(event.sensor_axis)
+                moved = event.lines_of_sight @ (M - _IDENTITY).T
                 yield replace(
                     event,
-                    points=event.points @ self.points.T,
-                    covariances=covariances,
+                    points=event.points + moved,
+                    covariances=None if covariances is None else M @ covariances @ M.T,
                     orientations=None,
                     orientation_covariances=None,
                 )
@@ -106,6 +106,17 @@ class Correction:
                 yield replace(event, body_velocity=scales * event.body_velocity)
             else:
                 yield replace(event, angular_velocity=self.turn * event.angular_velocity)
+
+    def points_seen_along(self, axis: FloatArray | None) -> FloatArray:
+        """Return by what lines of sight (3,) are multiplied that a sensor has which looks there.
+
+        Such a sensor is turned about z against the robot, whose axes those of the event are.
+        """
+        if axis is None or not axis[:2].any():
+            return self.points
+        R = so3.exp(np.array([0.0, 0.0, math.atan2(axis[1], axis[0])]))
+        turned: FloatArray = R @ self.points @ R.T
+        return turned
 
     def scale(self) -> float:
         """Return by what lengths are multiplied."""

@@ -8,9 +8,16 @@ import math
 import numpy as np
 import pytest
 
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.runs.mistakes import Correction, first_drive, mistakes, OPTICAL
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.runs.mistakes import (
+    Correction,
+    explained,
+    first_drive,
+    mistakes,
+    OPTICAL,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SETTINGS = Settings(
@@ -106,3 +113,42 @@ def test_a_robot_that_stands_is_looked_at_for_longer():
     parked = [VelocityEvent(k * PERIOD_NS, np.zeros(6)) for k in range(1000)]
     assert len(first_drive(parked)) == len(parked)
     assert first_drive([]) == []
+
+
+@pytest.mark.parametrize('kind', ['points_mirrored', 'points_in_millimetres'])
+def test_a_sensor_that_looks_sideways_from_a_mast_is_judged_in_its_own_axes(kind):
+    R, mast = so3.exp(np.array([0.0, 0.0, 1.2])), np.array([1.5, -0.5, 0.0])
+    wrong = [
+        event
+        if isinstance(event, VelocityEvent)
+        else replace(
+            event,
+            points=(event.points - mast) @ (R @ MADE[kind].points @ R.T).T + mast,
+            sensor=np.tile(mast, (len(event.points), 1)),
+            sensor_axis=R[:, 0],
+        )
+        for event in drive()
+    ]
+    assert kind in named(wrong)
+
+
+def test_two_mistakes_are_both_named():
+    twice = MADE['points_in_millimetres'].apply(MADE['points_in_optical_axes'].apply(drive()))
+    assert set(named(list(twice))) == {'points_in_millimetres', 'points_in_optical_axes'}
+    twice = list(MADE['speed_in_kmh'].apply(MADE['turning_in_degrees'].apply(drive())))
+    assert set(named(twice)) == {'speed_in_kmh', 'turning_in_degrees'}
+
+
+def test_the_factor_of_a_size_is_estimated():
+    (finding,) = mistakes(SETTINGS, list(MADE['tag_size'].apply(drive())))
+    assert float(finding.what.split(' times')[0].split()[-1]) == pytest.approx(1.25, abs=0.05)
+
+
+def test_what_a_mistake_explains_is_left_out():
+    symptoms = [found('slip'), found('noisy_odometry', factor=2.0, motion='turning', proposed='')]
+    others = [found('damaged', path='x', loss='y')]
+    assert explained(symptoms + others) == symptoms + others
+    assert explained([found('turning_negated'), *symptoms, *others]) == [
+        found('turning_negated'),
+        *others,
+    ]
