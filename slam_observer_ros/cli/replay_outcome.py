@@ -26,6 +26,7 @@ from slam_observer_ros.runs.accuracy import (
     smoothed_trajectory,
     SmoothedAccuracy,
 )
+from slam_observer_ros.runs.corrections import explained, SUSPICIOUS
 from slam_observer_ros.runs.error_health import of_errors
 from slam_observer_ros.runs.health import (
     of_estimate,
@@ -36,7 +37,6 @@ from slam_observer_ros.runs.health import (
     of_rejections,
 )
 from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
-from slam_observer_ros.runs.mistakes import explained, SUSPICIOUS
 from slam_observer_ros.runs.reported_run import NisTally, Replay, ReportedRun, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 

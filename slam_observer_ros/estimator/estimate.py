@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -89,6 +90,11 @@ class Estimate:
         """Name of the loaded map in whose frame the estimate is; empty if it is in none."""
         loaded = self._localiser.loaded
         return loaded.name if loaded is not None and self.is_localised else ''
+
+    @property
+    def loaded_maps(self) -> Sequence[LandmarkMap]:
+        """The maps that were loaded, in one of which the robot is; empty if none was."""
+        return tuple(self._localiser.maps)
 
     @property
     def landmark_map(self) -> LandmarkMap:

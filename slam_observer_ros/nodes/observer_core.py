@@ -30,6 +30,7 @@ from slam_observer_ros.nodes.map_services import MapServices, NamedMapServices
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
+from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
 from slam_observer_ros.nodes.ros_interface import read_settings
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -63,6 +64,8 @@ class DataFlow:
     output : EstimatePublisher
     feed : EstimatorFeed
     inputs : list of InputTopic
+    watch : MistakeWatch
+        Names a mistake of the set-up.
     timers : list of Timer
         They run only while something waits.
 
@@ -81,6 +84,7 @@ class DataFlow:
             on_jump=self._forget_time,
             judges_innovations=True,
         )
+        self.watch = MistakeWatch(node, self.estimator)
         self.buffer = TransformBuffer()
         self.output = EstimatePublisher(node, settings, self.estimator, self.buffer)
         self._transforms = LiveTransforms(
@@ -93,13 +97,14 @@ class DataFlow:
             BaseFrame(settings, self.buffer),
             on_events=self._publish_new,
             on_waiting=self._begin_to_retry,
+            note_event=self.watch.note,
         )
         self.inputs = open_inputs(node, settings, self.feed)
         _refuse_own_outputs(node, self.inputs)
         period_s = 1.0 / settings.publish_rate
         self._publish_timer = node.create_steady_timer(period_s, self._publish_waiting)
         self._retry_timer = node.create_steady_timer(RETRY_PERIOD_S, self._retry)
-        self.timers = [self._publish_timer, self._retry_timer]
+        self.timers = [self._publish_timer, self._retry_timer, self.watch.timer]
         self._is_catching_up = False
         window_s = estimator_settings.reorder_window
         self._are_late_if_they_wait = settings.landmarks_max_wait > window_s
@@ -115,6 +120,7 @@ class DataFlow:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""
         self.feed.clear()
         self.buffer.clear()
+        self.watch.clear()
         self.output.reset()
 
     def _publish_new(self, source: str) -> None:
@@ -214,6 +220,7 @@ class ObserverCore:
             flow.inputs,
             flow.output,
             self._localisation,
+            flow.watch,
             hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         self._offer_services(settings)

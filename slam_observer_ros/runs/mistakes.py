@@ -8,19 +8,17 @@ unit of what was recorded, k being 2 in the plane and 3 in space.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import combinations
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass, replace
 import logging
 import math
 import time
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.stamps import to_ns, to_s
-from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
@@ -34,6 +32,16 @@ from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.runs.accuracy import LikelihoodRecorder
+from slam_observer_ros.runs.corrections import (
+    ALIKE,
+    AS_IT_IS,
+    AS_SIZED,
+    Correction,
+    CORRECTIONS,
+    IN_DEGREES,
+    PAIRS,
+    SIZED,
+)
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -52,164 +60,11 @@ SURE, CLEAR = 15.0, 0.1
 NOTABLE_TURN_RAD = 1.0
 """Turn, by what is seen, that a robot which turns without saying so shows at least."""
 
-_IDENTITY = np.eye(3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Correction:
-    """What makes a recording right again that was made with a mistake of one kind."""
-
-    kind: str  # of finding; '' if nothing is wrong
-    points: FloatArray = field(default_factory=lambda: _IDENTITY)  # (3, 3), times each point
-    turn: float = 1.0  # times the angular velocity
-    drive: float = 1.0  # times the linear velocity
-    changes: Mapping[str, Any] = field(default_factory=dict)  # of settings, while it is judged
-    parts: tuple[Correction, ...] = ()  # of a pair of mistakes
-
-    def goes_with(self, other: Correction) -> bool:
-        """Return whether both can be of one set-up, and are not the same as a single one."""
-        kinds = {self.kind, other.kind}
-        return len(kinds) == 2 and kinds not in ALIKE
-
-    def and_then(self, other: Correction) -> Correction:
-        """Return the correction of both mistakes."""
-        return Correction(
-            '',
-            other.points @ self.points,
-            self.turn * other.turn,
-            self.drive * other.drive,
-            parts=(self, other),
-        )
-
-    def apply(
-        self, events: Iterable[Event], noise: ObservationNoise | None = None
-    ) -> Iterable[Event]:
-        """Yield the events as they should have been recorded.
-
-        With ``noise`` points keep theirs, as a share of their distance: else a world that shrinks
-        would be likelier where noise is stated too large.
-        """
-        scales = np.repeat([self.turn, self.drive], 3)
-        for event in events:
-            if isinstance(event, ObservationEvent):
-                covariances = event.covariances if noise is None else noise.covariances(event)
-                M = self.points_seen_along(event.sensor_axis)
-                moved = event.lines_of_sight @ (M - _IDENTITY).T
-                yield replace(
-                    event,
-                    points=event.points + moved,
-                    covariances=None if covariances is None else M @ covariances @ M.T,
-                    orientations=None,
-                    orientation_covariances=None,
-                )
-            elif isinstance(event, VelocityEvent):
-                yield replace(event, body_velocity=scales * event.body_velocity)
-            else:
-                yield replace(event, angular_velocity=self.turn * event.angular_velocity)
-
-    def points_seen_along(self, axis: FloatArray | None) -> FloatArray:
-        """Return by what lines of sight (3,) are multiplied that a sensor has which looks there.
-
-        Such a sensor is turned about z against the robot, whose axes those of the event are.
-        """
-        if axis is None or not axis[:2].any():
-            return self.points
-        R = so3.exp(np.array([0.0, 0.0, math.atan2(axis[1], axis[0])]))
-        turned: FloatArray = R @ self.points @ R.T
-        return turned
-
-    def scale(self) -> float:
-        """Return by what lengths are multiplied."""
-        return float(abs(np.linalg.det(self.points)) ** (1.0 / 3.0))
-
-
-OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""From a camera's axes, z forward and x to the right, to a robot's."""
-
-IN_DEGREES = math.radians(1.0)
-
-SIZED = {'linear_scale_stddev': (0.0, 0.0, 0.0)}
-"""A wheel's scale that is estimated would make up for the size of tags."""
-
-AS_IT_IS, AS_SIZED = Correction(''), Correction('', changes=SIZED)
-
-CORRECTIONS = (
-    Correction('points_in_optical_axes', OPTICAL),
-    Correction('points_mirrored', np.diag([1.0, -1.0, 1.0])),
-    Correction('points_backwards', np.diag([-1.0, -1.0, 1.0])),
-    Correction('points_in_millimetres', 1e-3 * _IDENTITY),
-    *(
-        Correction('tag_size', s * _IDENTITY, changes=SIZED)
-        for s in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
-    ),
-    Correction('turning_in_degrees', turn=IN_DEGREES),
-    Correction('speed_in_kmh', drive=1.0 / 3.6),
-    Correction('turning_negated', turn=-1.0),
-    Correction('driving_negated', drive=-1.0),
-)
-
-MISTAKES = frozenset({'no_turning', *(each.kind for each in CORRECTIONS)})
-"""Kinds of finding that name a mistake of the set-up."""
-
-ALIKE = ({'points_mirrored', 'turning_negated'}, {'points_backwards', 'driving_negated'})
-"""Mirror images of each other, and what differs by which end of the robot is its front."""
-
-PAIRS = tuple(
-    one.and_then(other)
-    for one, other in combinations([each for each in CORRECTIONS if not each.changes], 2)
-    if one.goes_with(other)
-)
-
 ROUGHLY = 0.2
 """Deviation of a scale that is known to the next of the sizes that are tried."""
 
 EARLY, TRIED = 1.0 / 3.0, 3
 """Part of the drive by which corrections are chosen that are tried on the whole, and how many."""
-
-SYMPTOMS = frozenset(
-    {
-        'rejected_points',
-        'left_out_points',
-        'unmapped_points',
-        'unknown_pose',
-        'no_place',
-        'lost_pose',
-        'wrong_pose',
-        'contradicted_pose',
-        'diverged',
-        'not_relinearised',
-        'slip',
-        'unexpected_place',
-        'moved_landmark',
-        'many_moved',
-        'carried_landmark',
-        'late_odometry',
-        'implausible_calibration',
-        'mounting',
-        'range_scale',
-        'depth_for_range',
-        'noisy_odometry',
-        'axis_noise',
-        'motion_noise',
-        'point_noise',
-        'small_noise',
-        'large_noise',
-        'overconfident_pose',
-        'error_growth',
-    }
-)
-"""Findings that a mistake of the set-up may cause, and whose remedies would then be untrue."""
-
-SUSPICIOUS = SYMPTOMS - {'large_noise', 'error_growth', 'axis_noise', 'left_out_points'}
-"""Those of them that are reason to look for one."""
-
-
-def explained(findings: Iterable[Finding]) -> list[Finding]:
-    """Return findings without those that a mistake of the set-up which is among them explains."""
-    findings = list(findings)
-    names_one = any(each.kind in MISTAKES for each in findings)
-    return [each for each in findings if not names_one or each.kind not in SYMPTOMS]
-
 
 LEAST_TURN_RAD = 1.0
 """Turn in all that must be left of an angular velocity which is taken for one in degrees."""
@@ -348,28 +203,16 @@ def _findings(corrections: Iterable[Correction], known: Maps | None) -> list[Fin
     return findings
 
 
-def turned(events: Iterable[Event]) -> float:
-    """Return by how much the velocities turn the robot in all, radians if they are in rad/s."""
-    total, last = 0.0, None
-    for event in events:
-        if isinstance(event, VelocityEvent):
-            if last is not None:
-                held_s = min(to_s(max(event.stamp_ns - last.stamp_ns, 0)), 1.0)
-                total += held_s * float(np.linalg.norm(last.body_velocity[:3]))
-            last = event
-    return total
-
-
 def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
     """Return the events until the robot has driven for DRIVE_S, with points that have ids.
 
     Or until a ``part`` of that.
     """
     kept: list[Event] = []
-    driven_ns, turned_rad, last, first_ns = 0, 0.0, None, None
+    drive, first_ns = _Drive(), None
     for event in events:
         first_ns = event.stamp_ns if first_ns is None else first_ns
-        is_enough = driven_ns > part * to_ns(DRIVE_S) and turned_rad > part * TURNED_RAD
+        is_enough = drive.driven_s > part * DRIVE_S and drive.turned_rad > part * TURNED_RAD
         if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
             break
         if isinstance(event, ObservationEvent):
@@ -377,12 +220,41 @@ def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
             continue
         kept.append(event)
         if isinstance(event, VelocityEvent):
-            if last is not None and last.body_velocity.any():
-                held_ns = min(max(event.stamp_ns - last.stamp_ns, 0), to_ns(1.0))
-                driven_ns += held_ns
-                turned_rad += to_s(held_ns) * float(np.linalg.norm(last.body_velocity[:3]))
-            last = event
+            drive.add(event)
     return kept
+
+
+def driven_s(events: Iterable[Event]) -> float:
+    """Return for how long the robot drives in all, seconds."""
+    return _driven(events).driven_s
+
+
+def turned(events: Iterable[Event]) -> float:
+    """Return by how much the velocities turn the robot in all, radians if they are in rad/s."""
+    return _driven(events).turned_rad
+
+
+class _Drive:
+    """Sums up the velocities; one that is held for more than a second says nothing any more."""
+
+    def __init__(self) -> None:
+        self.driven_s, self.turned_rad = 0.0, 0.0
+        self._last: VelocityEvent | None = None
+
+    def add(self, event: VelocityEvent) -> None:
+        if self._last is not None and self._last.body_velocity.any():
+            held_s = min(to_s(max(event.stamp_ns - self._last.stamp_ns, 0)), 1.0)
+            self.driven_s += held_s
+            self.turned_rad += held_s * float(np.linalg.norm(self._last.body_velocity[:3]))
+        self._last = event
+
+
+def _driven(events: Iterable[Event]) -> _Drive:
+    drive = _Drive()
+    for event in events:
+        if isinstance(event, VelocityEvent):
+            drive.add(event)
+    return drive
 
 
 def never_turns(events: Iterable[Event]) -> bool:
@@ -435,7 +307,7 @@ def _score(
         for each in events
         if isinstance(each, ObservationEvent)
     )
-    recorder, attitudes = LikelihoodRecorder(k, scale * reach), [_IDENTITY]
+    recorder, attitudes = LikelihoodRecorder(k, scale * reach), [np.eye(3)]
 
     def note_update(update: Update) -> None:
         recorder.note_update(update)

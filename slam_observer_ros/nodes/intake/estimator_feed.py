@@ -59,6 +59,8 @@ class EstimatorFeed:
         Called after events were used, with the name of the input that gave them; '' for several.
     on_waiting : callable
         Called when something begins to wait: :meth:`retry` is to be called often from then on.
+    note_event : callable
+        Called with each event that the estimator gets.
 
     Attributes
     ----------
@@ -83,6 +85,7 @@ class EstimatorFeed:
         base_frame: BaseFrame,
         on_events: Callable[[str], None],
         on_waiting: Callable[[], None],
+        note_event: Callable[[Event], None],
     ) -> None:
         self._node = node
         self._settings = settings
@@ -111,6 +114,7 @@ class EstimatorFeed:
         self.is_active = False
         self.is_paused = False
         self.on_events, self._on_waiting = on_events, on_waiting
+        self._note_event = note_event
 
     @property
     def is_waiting(self) -> bool:
@@ -224,6 +228,7 @@ class EstimatorFeed:
         # All before the first is used: if that shows a jump of the clock, offsets are forgotten.
         for event in [self._in_own_time(event) for event in events]:
             start_s = time.perf_counter()
+            self._note_event(event)
             try:
                 self._estimator.add(event)
             except Exception as error:  # noqa: BLE001  # whatever it is, the next one may be used

@@ -17,6 +17,8 @@ from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus
+from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
+from slam_observer_ros.runs.corrections import explained
 from slam_observer_ros.runs.health import (
     estimator_values,
     of_estimate,
@@ -47,6 +49,7 @@ class DiagnosticsPublisher:
         inputs: Sequence[InputTopic[Any]],
         estimate_publisher: EstimatePublisher,
         localisation: LocalisationStatus,
+        watch: MistakeWatch,
         hardware_id: str,
     ) -> None:
         self._node = node
@@ -56,6 +59,7 @@ class DiagnosticsPublisher:
         self._inputs = inputs
         self._estimate_publisher = estimate_publisher
         self._localisation = localisation
+        self._watch = watch
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._seen_s: float | None = None  # when a landmark was seen last
@@ -71,7 +75,9 @@ class DiagnosticsPublisher:
     def publish(self) -> None:
         """Publish the status of the estimate and of the localisation, about once a second."""
         dropped, new = self._progress()
-        findings = self._findings(dropped, new)
+        symptoms = self._findings(dropped, new)
+        self._watch.look([*symptoms, *self._localisation.findings], has_slipped=new['slip'] > 0)
+        findings = explained([*self._watch.findings, *symptoms])
         level = max((finding.level for finding in findings), default=Level.NOTE)
         used = new['velocity'] + new['observation']
         if dropped and not used and not self._feed.is_paused:

@@ -85,11 +85,16 @@ class LocalisationStatus:
         self._was_localised |= is_localised
         self._publisher.publish(Bool(data=is_localised))
 
+    @property
+    def findings(self) -> list[Finding]:
+        """What is wrong with the noise that is stated."""
+        return self._noise.findings
+
     def status(self, hardware_id: str) -> DiagnosticStatus:
         """Return the status for /diagnostics."""
         deviations = self._deviations()
         level, message = self._judge(deviations)
-        for finding in self._noise.findings:
+        for finding in self.findings:
             if finding.level >= Level.WARNING:
                 level = max(level, DiagnosticStatus.WARN)
                 message = f'{message}; {finding.what}'

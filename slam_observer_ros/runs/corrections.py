@@ -1,0 +1,169 @@
+"""Which mistakes of a set-up there are: what each makes right again, and what else it explains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+import math
+from typing import Any
+
+import numpy as np
+
+from slam_observer_ros.common.findings import Finding
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+
+_IDENTITY = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What makes a recording right again that was made with a mistake of one kind."""
+
+    kind: str  # of finding; '' if nothing is wrong
+    points: FloatArray = field(default_factory=lambda: _IDENTITY)  # (3, 3), times each point
+    turn: float = 1.0  # times the angular velocity
+    drive: float = 1.0  # times the linear velocity
+    changes: Mapping[str, Any] = field(default_factory=dict)  # of settings, while it is judged
+    parts: tuple[Correction, ...] = ()  # of a pair of mistakes
+
+    def goes_with(self, other: Correction) -> bool:
+        """Return whether both can be of one set-up, and are not the same as a single one."""
+        kinds = {self.kind, other.kind}
+        return len(kinds) == 2 and kinds not in ALIKE
+
+    def and_then(self, other: Correction) -> Correction:
+        """Return the correction of both mistakes."""
+        return Correction(
+            '',
+            other.points @ self.points,
+            self.turn * other.turn,
+            self.drive * other.drive,
+            parts=(self, other),
+        )
+
+    def apply(
+        self, events: Iterable[Event], noise: ObservationNoise | None = None
+    ) -> Iterable[Event]:
+        """Yield the events as they should have been recorded.
+
+        With ``noise`` points keep theirs, as a share of their distance: else a world that shrinks
+        would be likelier where noise is stated too large.
+        """
+        scales = np.repeat([self.turn, self.drive], 3)
+        for event in events:
+            if isinstance(event, ObservationEvent):
+                covariances = event.covariances if noise is None else noise.covariances(event)
+                M = self.points_seen_along(event.sensor_axis)
+                moved = event.lines_of_sight @ (M - _IDENTITY).T
+                yield replace(
+                    event,
+                    points=event.points + moved,
+                    covariances=None if covariances is None else M @ covariances @ M.T,
+                    orientations=None,
+                    orientation_covariances=None,
+                )
+            elif isinstance(event, VelocityEvent):
+                yield replace(event, body_velocity=scales * event.body_velocity)
+            else:
+                yield replace(event, angular_velocity=self.turn * event.angular_velocity)
+
+    def points_seen_along(self, axis: FloatArray | None) -> FloatArray:
+        """Return by what lines of sight (3,) are multiplied that a sensor has which looks there.
+
+        Such a sensor is turned about z against the robot, whose axes those of the event are.
+        """
+        if axis is None or not axis[:2].any():
+            return self.points
+        R = so3.exp(np.array([0.0, 0.0, math.atan2(axis[1], axis[0])]))
+        turned: FloatArray = R @ self.points @ R.T
+        return turned
+
+    def scale(self) -> float:
+        """Return by what lengths are multiplied."""
+        return float(abs(np.linalg.det(self.points)) ** (1.0 / 3.0))
+
+
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""From a camera's axes, z forward and x to the right, to a robot's."""
+
+IN_DEGREES = math.radians(1.0)
+
+SIZED = {'linear_scale_stddev': (0.0, 0.0, 0.0)}
+"""A wheel's scale that is estimated would make up for the size of tags."""
+
+AS_IT_IS, AS_SIZED = Correction(''), Correction('', changes=SIZED)
+
+CORRECTIONS = (
+    Correction('points_in_optical_axes', OPTICAL),
+    Correction('points_mirrored', np.diag([1.0, -1.0, 1.0])),
+    Correction('points_backwards', np.diag([-1.0, -1.0, 1.0])),
+    Correction('points_in_millimetres', 1e-3 * _IDENTITY),
+    *(
+        Correction('tag_size', s * _IDENTITY, changes=SIZED)
+        for s in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
+    ),
+    Correction('turning_in_degrees', turn=IN_DEGREES),
+    Correction('speed_in_kmh', drive=1.0 / 3.6),
+    Correction('turning_negated', turn=-1.0),
+    Correction('driving_negated', drive=-1.0),
+)
+
+MISTAKES = frozenset({'no_turning', *(each.kind for each in CORRECTIONS)})
+"""Kinds of finding that name a mistake of the set-up."""
+
+ALIKE = ({'points_mirrored', 'turning_negated'}, {'points_backwards', 'driving_negated'})
+"""Mirror images of each other, and what differs by which end of the robot is its front."""
+
+PAIRS = tuple(
+    one.and_then(other)
+    for one, other in combinations([each for each in CORRECTIONS if not each.changes], 2)
+    if one.goes_with(other)
+)
+
+SYMPTOMS = frozenset(
+    {
+        'rejected_points',
+        'left_out_points',
+        'unmapped_points',
+        'unknown_pose',
+        'no_place',
+        'lost_pose',
+        'wrong_pose',
+        'contradicted_pose',
+        'diverged',
+        'not_relinearised',
+        'slip',
+        'unexpected_place',
+        'moved_landmark',
+        'many_moved',
+        'carried_landmark',
+        'late_odometry',
+        'implausible_calibration',
+        'mounting',
+        'range_scale',
+        'depth_for_range',
+        'noisy_odometry',
+        'axis_noise',
+        'motion_noise',
+        'point_noise',
+        'small_noise',
+        'large_noise',
+        'overconfident_pose',
+        'error_growth',
+    }
+)
+"""Findings that a mistake of the set-up may cause, and whose remedies would then be untrue."""
+
+SUSPICIOUS = SYMPTOMS - {'large_noise', 'error_growth', 'axis_noise', 'left_out_points'}
+"""Those of them that are reason to look for one."""
+
+
+def explained(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings without those that a mistake of the set-up which is among them explains."""
+    findings = list(findings)
+    names_one = any(each.kind in MISTAKES for each in findings)
+    return [each for each in findings if not names_one or each.kind not in SYMPTOMS]
