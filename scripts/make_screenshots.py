@@ -51,7 +51,9 @@ def convert(directory: str, name: str, *data_set: str) -> Path:
 
 def main() -> None:
     """Make all pictures that the data at hand allows."""
-    replay(CHECKOUT / 'samples' / 'sample.mcap', 60.0, 'sample')
+    sample = CHECKOUT / 'samples' / 'sample.mcap'
+    replay(sample, 60.0, 'sample')
+    replay(sample, 60.0, 'backwards', '--set', 'sensor_pose=[0, 0, 0, 0, 0, 3.1416]')
     data = Path(os.environ.get('SLAM_OBSERVER_DATA', CHECKOUT / '..' / 'shared' / 'data'))
     with tempfile.TemporaryDirectory() as directory:
         circle = Path(directory) / 'circle.mcap'

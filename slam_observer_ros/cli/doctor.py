@@ -22,6 +22,7 @@ from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.known_map.map_file import read_maps
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.observer import core
@@ -65,6 +66,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--seconds', type=float, default=3.0, metavar='S', help='how long to listen (default 3)'
     )
+    parser.add_argument(
+        '--load-map',
+        type=named_path,
+        metavar='MAP',
+        help='map that the robot was in, by which mistakes of the set-up are judged',
+    )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.set_defaults(run=run)
 
@@ -73,9 +80,12 @@ def run(args: argparse.Namespace) -> None:
     """Look, listen and print."""
     if not 0.0 < args.seconds <= 3600.0:
         raise UsageError(f'--seconds takes seconds above 0, up to 3600, not {args.seconds:g}')
+    if args.load_map is not None and args.recording is None:
+        raise UsageError('--load-map takes a recording, which is judged by the map')
     if args.recording is not None:
+        maps = None if args.load_map is None else read_maps(args.load_map)
         name, why, events = fitting_file(args.recording)
-        findings = mistakes(_shipped_settings(name), events)
+        findings = mistakes(_shipped_settings(name), events, maps)
         if args.json:
             print_json(
                 {

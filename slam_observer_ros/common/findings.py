@@ -91,7 +91,8 @@ KINDS = {
     'points_backwards': Kind(
         Level.ERROR,
         'the sensor looks backwards: it is mounted turned by 180° about z',
-        'state so in /tf, or end sensor_pose by 0.0, 0.0, 3.1416',
+        'state so in /tf, or end sensor_pose by 0.0, 0.0, 3.1416, or see whether it is the speed '
+        'that is negated',
     ),
     'points_in_millimetres': Kind(
         Level.ERROR, 'the points are in millimetres', 'let the detector publish metres (REP 103)'
@@ -117,7 +118,7 @@ KINDS = {
     'driving_negated': Kind(
         Level.ERROR,
         'the speed is negated: forward is positive (REP 103)',
-        'see the signs of the driver, or how its frame is turned',
+        'see the signs of the driver, or whether it is the sensor that looks backwards',
     ),
     'no_turning': Kind(
         Level.ERROR,

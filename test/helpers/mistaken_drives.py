@@ -8,6 +8,7 @@ import numpy as np
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.runs.corrections import Correction, OPTICAL
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -36,10 +37,22 @@ MADE = {
 }
 
 
+def landmarks_of(rng):
+    """Return where they are (25, 3), metres; the first that is drawn of a seed."""
+    return np.column_stack([rng.uniform(-9.0, 9.0, (25, 2)), np.zeros(25)])
+
+
+def surveyed(seed=0):
+    """Return the map that a survey has made of them."""
+    points = landmarks_of(np.random.default_rng(seed))
+    covariances = np.tile(1e-4 * np.eye(3), (25, 1, 1))
+    return LandmarkMap(np.arange(25), points, covariances, np.zeros(25, dtype=np.int64))
+
+
 def drive(seed=0, seconds=60.0, false=0.0):
     """Events of a robot that drives an eight among landmarks, as noisy as stated."""
     rng, events, A = np.random.default_rng(seed), [], np.eye(4)
-    landmarks = np.column_stack([rng.uniform(-9.0, 9.0, (25, 2)), np.zeros(25)])
+    landmarks = landmarks_of(rng)
     for step in range(round(seconds * 1e9 / PERIOD_NS)):
         stamp_ns, dt_s = (step + 1) * PERIOD_NS, PERIOD_NS * 1e-9
         V = np.array([0.0, 0.0, 0.5 if step % 500 < 250 else -0.5, 0.6, 0.0, 0.0])
