@@ -72,6 +72,13 @@ KINDS = {
     'silent_input': Kind(
         Level.WARNING, "no message on '{topic}'", 'see whether its driver has stopped'
     ),
+    'several_types': Kind(
+        Level.WARNING,
+        "two types are published on '{topic}', of which one can be heard at a time: {heard} is "
+        'heard, and {others} is not',
+        'let all publish one type, remap the others, or choose one by velocity_type or '
+        'landmarks_type',
+    ),
     'empty_messages': Kind(
         Level.WARNING,
         'no landmark in {count} messages so far',

@@ -181,6 +181,40 @@ def test_a_busy_node_a_silent_driver_and_a_stopped_clock_are_distinguished(
     assert not source.problem
 
 
+def test_of_two_types_on_a_topic_the_one_that_comes_is_heard(monkeypatch):
+    node, now_s = Mock(), [1000.0]
+    monkeypatch.setattr(time, 'monotonic', lambda: now_s[0])
+    node.get_clock.return_value = FakeClock()
+    node.resolve_topic_name.return_value = '/cmd_vel'
+    teleop, nav = (
+        Mock(topic_type=f'geometry_msgs/msg/{name}', qos_profile=QOS, node_namespace='/')
+        for name in ('Twist', 'TwistStamped')
+    )
+    decoders = {each.topic_type: decode_twist for each in (teleop, nav)}
+    source = InputTopic(node, 'twist', decoders, Mock(), QOS)
+
+    def heard_after(seconds, publishers):
+        node.get_publishers_info_by_topic.return_value = publishers
+        for _ in range(4 * seconds):
+            now_s[0] += 0.25
+            source.check_publishers()
+        return node.create_subscription.call_args.args[0].__name__
+
+    assert heard_after(3, [teleop]) == 'Twist'
+    assert heard_after(1, [teleop, nav]) == 'TwistStamped'
+    assert source.doubt == found(
+        'several_types', topic='/cmd_vel', heard=nav.topic_type, others=teleop.topic_type
+    )
+    node.create_subscription.call_args.args[2](TWIST, {'received_timestamp': 0})
+    assert heard_after(4, [teleop, nav]) == 'TwistStamped', 'a pause of what has come is usual'
+    assert heard_after(2, [teleop, nav]) == 'Twist'
+    assert heard_after(3, [teleop, nav]) == 'TwistStamped'
+    listened = [call.args[0] for call in node.get_logger().info.call_args_list]
+    assert len(listened) == 2, 'each type is said once'
+    heard_after(1, [nav])
+    assert source.doubt is None
+
+
 def test_a_node_that_was_not_to_look_was_not_busy(monkeypatch):
     node, now_s = Mock(), [1000.0]
     monkeypatch.setattr(time, 'monotonic', lambda: now_s[0])

@@ -20,7 +20,8 @@ from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.lateness import Backlog, LoadShedding, Waiting
-from slam_observer_ros.nodes.ros_interface import message_class
+from slam_observer_ros.nodes.intake.type_choice import TypeChoice
+from slam_observer_ros.nodes.ros_interface import is_installed, message_class
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.
@@ -82,7 +83,7 @@ class InputTopic(Generic[MessageT]):
     decoders : mapping of str to callable
         From full type names to decoders, the preferred type first. If there is only one, it is
         subscribed to at once (a ParameterError if its package is not installed); of several, the
-        one that is found on the topic.
+        one that comes on the topic.
     on_message : callable
         Called with each decoded message and the ROS time of its reception in nanoseconds.
     qos : QoSProfile
@@ -133,7 +134,8 @@ class InputTopic(Generic[MessageT]):
         self.read_first: Sequence[InputTopic[Any]] = ()
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
-        self._type_name = ''
+        self._types = TypeChoice()
+        self._several_types: Finding | None = None
         self.name = name
         self.topic = node.resolve_topic_name(name)
         self.received = 0
@@ -172,7 +174,7 @@ class InputTopic(Generic[MessageT]):
         if self._fault:
             return self._fault
         if self.received == 0:
-            wanted = self._type_name or self._wanted
+            wanted = self._types.chosen or self._wanted
             return f"no message yet on '{self.topic}' ({wanted})"
         now_s = time.monotonic()
         if (silent_s := self.silent_s) > DISCOVERY_S:
@@ -192,8 +194,9 @@ class InputTopic(Generic[MessageT]):
 
     @property
     def doubt(self) -> Finding | None:
-        """What the decoder finds wrong with what messages say; None if nothing."""
-        return getattr(self._decoders.get(self._type_name), 'doubt', None)
+        """What is wrong with the types or the content of messages; None if nothing."""
+        of_content: Finding | None = getattr(self._decoders.get(self._types.chosen), 'doubt', None)
+        return self._several_types or of_content
 
     def check_publishers(self) -> None:
         """See what the topic carries; subscribe to it, or report why nothing comes.
@@ -209,13 +212,7 @@ class InputTopic(Generic[MessageT]):
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         types = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in types]
-        missing = ''
-        if usable and self._type_name not in usable:
-            # A topic has one type at a time, and the executor lets go of the old one after this.
-            if self._subscription is None:
-                missing = self._subscribe_if_installed(usable[0])
-            else:
-                self.close()
+        missing = self._listen_for_one_of(usable, now_s)
         self._fault = missing or self._find_fault(publishers, usable)
         if problem := self.problem or (self.doubt and self.doubt.text()):
             self._log.warning(self.topic, problem)
@@ -239,6 +236,29 @@ class InputTopic(Generic[MessageT]):
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
+    def _listen_for_one_of(self, usable: list[str], now_s: float) -> str:
+        """Listen for a type that comes; return why no message can be heard, or ''."""
+        if len(usable) > 1:
+            usable = [name for name in usable if is_installed(name)] or usable
+        self._several_types = None
+        if not usable:
+            return ''
+        last_s = max(self.last_received_s or 0.0, self._resumed_s)
+        chosen = self._types.best_of(usable, last_s, now_s)
+        missing = ''
+        if chosen != self._types.chosen:
+            # A topic has one type at a time, and the executor lets go of the old one after this.
+            if self._subscription is None:
+                missing = self._subscribe_if_installed(chosen)
+            else:
+                self.close()
+        if len(usable) > 1:
+            others = ', '.join(name for name in usable if name != chosen)
+            self._several_types = found(
+                'several_types', topic=self.topic, heard=chosen, others=others
+            )
+        return missing
+
     def _subscribe_if_installed(self, type_name: str) -> str:
         """Subscribe to what was found on the topic; return which package that would need."""
         try:
@@ -249,11 +269,12 @@ class InputTopic(Generic[MessageT]):
 
     def _subscribe(self, type_name: str) -> None:
         kind = message_class(type_name)
-        self._type_name = type_name
+        is_new = self._types.choose(type_name, time.monotonic())
         self._subscription = self._node.create_subscription(
             kind, self.topic, with_info(self._receive), self._qos, raw=True
         )
-        self._node.get_logger().info(f"listening for {type_name} on '{self.topic}'")
+        if is_new:
+            self._node.get_logger().info(f"listening for {type_name} on '{self.topic}'")
 
     def read_waiting(self) -> None:
         """Read what waits now, each message after what the other inputs received before it."""
@@ -302,8 +323,9 @@ class InputTopic(Generic[MessageT]):
         receive_ns = self._reception_ns(self._received_ns)
         self.received += 1
         self.last_received_s = time.monotonic()
+        self._types.note_message()
         try:
-            message = self._decoders[self._type_name](raw, receive_ns)
+            message = self._decoders[self._types.chosen](raw, receive_ns)
         except MessageError as error:
             self.malformed += 1
             finding = found('malformed_message', topic=f"'{self.topic}'", error=error)
@@ -341,7 +363,10 @@ class InputTopic(Generic[MessageT]):
             types = sorted({publisher.topic_type for publisher in publishers})
             hint = ''.join(f'; set {self.advice[t]}' for t in types if t in self.advice)
             return f"'{self.topic}' carries {', '.join(types)}; {wanted} is needed{hint}"
-        if not self.is_shared and (text := rivals(self.topic, publishers)):
+        # Where they publish several types, the finding of that names the cause.
+        if not (self.is_shared or self._several_types) and (
+            text := rivals(self.topic, publishers)
+        ):
             return text
         for publisher in publishers:
             compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
