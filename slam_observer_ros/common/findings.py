@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from enum import IntEnum
 
@@ -564,3 +565,23 @@ def found(kind: str, /, **figures: object) -> Finding:
     return Finding(
         kind, stated.level, stated.what.format(**figures), stated.remedy.format(**figures)
     )
+
+
+NAMED = 3
+"""Problems that a line for people names: the others have to be looked up."""
+
+
+def worst_first(findings: Sequence[Finding], faults: Sequence[str]) -> list[str]:
+    """Return what is wrong in words: errors, then faults of the inputs, then the rest.
+
+    Faults come before other warnings, which may be their symptoms.
+    """
+    by_level = sorted(findings, key=lambda finding: -finding.level)
+    errors = [finding.what for finding in by_level if finding.level == Level.ERROR]
+    return [*errors, *faults, *(each.what for each in by_level[len(errors) :])]
+
+
+def in_brief(problems: Sequence[str]) -> str:
+    """Return the first problems on one line, and how many more there are."""
+    more = len(problems) - NAMED
+    return '; '.join([*problems[:NAMED], *([f'and {more} more'] if more > 0 else [])])

@@ -12,7 +12,7 @@ from dataclasses import replace
 import math
 from typing import Any, Protocol
 
-from slam_observer_ros.common.findings import Finding, found, Level
+from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.estimates import (
     CalibrationEstimate,
@@ -303,13 +303,13 @@ def diagnostics(
 ) -> Any:
     """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
     findings = of_velocity(estimator) + of_estimate(estimator)
-    warnings = [finding.what for finding in findings]
+    problems = worst_first(findings, [])
     values = estimator_values(estimator, estimator.dropped, findings)
     status = messages.make(
         'diagnostic_msgs/msg/DiagnosticStatus',
-        level=Level.WARNING if warnings else Level.NOTE,
+        level=Level.WARNING if problems else Level.NOTE,
         name='observer_node: estimate',
-        message='; '.join(warnings) or 'running',
+        message=in_brief(problems) or 'running',
         hardware_id=hardware_id,
         values=[
             messages.make('diagnostic_msgs/msg/KeyValue', key=key, value=value)

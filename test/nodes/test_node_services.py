@@ -302,8 +302,9 @@ class Publishing:
         self.estimate_publisher = SimpleNamespace(
             problem='', rivals=str, early_odometry=str, odometry_age_s=None
         )
-        localisation = SimpleNamespace(status=lambda _hardware_id: DiagnosticStatus())
-        parts = self.estimator, self.feed, inputs, self.estimate_publisher, localisation
+        localisation = SimpleNamespace(status=lambda _hardware_id: DiagnosticStatus(), findings=[])
+        watch = Mock(findings=[])
+        parts = self.estimator, self.feed, inputs, self.estimate_publisher, localisation, watch
         self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')
 
     def publish(self, **new):
@@ -411,6 +412,27 @@ def test_what_is_dropped_in_a_pause_is_no_error():
     publishing.feed.dropped['paused'] += 3
     status = publishing.publish()
     assert (status.level, status.message) == (DiagnosticStatus.WARN, 'paused')
+
+
+def test_the_worst_is_named_first_three_at_most_and_all_are_in_the_values():
+    inputs = [
+        Mock(
+            topic=f'/{name}', received=count, malformed=0, age_s=3.0, problem='', doubt=None,
+            silent_s=silent_s, shedding=Mock(shed=0), backlog=Mock(wait_s=0.0),
+        )
+        for name, count, silent_s in (('landmarks', 30, 3.0), ('imu', 0, 3.0), ('twist', 99, 0.0))
+    ]  # fmt: skip
+    for each in inputs:
+        each.name = each.topic.removeprefix('/')
+    publishing = Publishing(*inputs, velocity_is_stale=True, stamp_ns=1)
+    publishing.feed.dropped['no_transform'] += 5
+    publishing.estimate_publisher.problem = 'no odometry'
+    status = publishing.publish(velocity=1)
+    problems = [value for key, value in values_of(status).items() if key.startswith('problem ')]
+    assert status.level == DiagnosticStatus.ERROR
+    assert problems[:2] == ["none of 30 messages on '/landmarks' was used", 'no odometry']
+    assert len(problems) == 6
+    assert status.message == '; '.join([*problems[:3], 'and 3 more'])
 
 
 def test_what_cannot_be_published_is_reported():

@@ -9,7 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from slam_observer_ros.common.findings import Finding, found, Level
+from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
 from slam_observer_ros.common.types import is_automatic
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.nodes.guarded_node import GuardedNode
@@ -82,18 +82,19 @@ class DiagnosticsPublisher:
         used = new['velocity'] + new['observation']
         if dropped and not used and not self._feed.is_paused:
             level = Level.ERROR
-        problems = [finding.what for finding in findings] + self._faults()
+        problems = worst_first(findings, self._faults())
         if problems:
             level = max(level, Level.WARNING)
         now_s = time.monotonic()
         self._since_s = {each.kind: self._since_s.get(each.kind, now_s) for each in findings}
         values = self._input_values() | self._estimator_values(findings)
+        values |= {f'problem {i}': problem for i, problem in enumerate(problems, start=1)}
         values |= {f'{kind}, for [s]': f'{now_s - t:.0f}' for kind, t in self._since_s.items()}
         status = DiagnosticStatus(
             level=bytes([level]),
             name=f'{self._node.get_fully_qualified_name().lstrip("/")}: estimate',
             hardware_id=self._hardware_id,
-            message='; '.join(problems) or 'running',
+            message=in_brief(problems) or 'running',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status, self._localisation.status(self._hardware_id)])
