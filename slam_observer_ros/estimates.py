@@ -19,6 +19,7 @@ UNUSED_POINTS = {
     'impossible_id': 'of an impossible id',
     'bad_point': 'with NaN in what is stated of them',
     'unmapped_landmark': 'not mapped',
+    'waiting_point': 'half points of landmarks that are not known yet',
 }
 """Names under which observed points that are not used are counted, and what they are."""
 

@@ -27,6 +27,10 @@ UNKNOWN_ID = -1
 IMPOSSIBLE_ID = -(2**31)
 """Landmark id of a point whose message has a number there that can't be one: it is not used."""
 
+POINT, BEARING, RANGE, AZIMUTH, AZIMUTH_RANGE = range(5)
+"""What is measured of a landmark: all; its direction; its distance; or its direction about the
+base's z, alone or with the distance. What is not measured is no part of the event."""
+
 MAX_ID = 2**32 - 2
 """Largest landmark id: they go out as uint32, whose last one says that it is unknown."""
 
@@ -137,7 +141,12 @@ class AngularVelocityEvent:
 
 @dataclass(frozen=True, slots=True)
 class ObservationEvent:
-    """Landmarks seen at one instant."""
+    """Landmarks seen at one instant.
+
+    Of a half point (``kinds``) the line of sight, from ``sensor`` to ``points``, has only what
+    was measured: a unit vector for its direction, or the distance in any direction. A stated
+    covariance is along and across that line, in rad² across a unit vector.
+    """
 
     kind: ClassVar = 'observation'
     stamp_ns: int
@@ -156,6 +165,7 @@ class ObservationEvent:
     sensed: Sensed | None = None  # as the sensor showed them, where they have been corrected
     # (m,) such as tag36h11, of fiducials whose poses are on /tf: points are NaN until looked up.
     families: tuple[str, ...] | None = None
+    kinds: IntArray | None = None  # (m,) POINT to AZIMUTH_RANGE; None where all are whole points
 
     def moved(self, pose: FloatArray) -> ObservationEvent:
         """Return it in the frame in which its own has ``pose`` (4, 4)."""
@@ -242,7 +252,7 @@ def _turned(covariances: FloatArray, R: FloatArray) -> FloatArray:
 
 _OF_POINTS = (
     'ids', 'points', 'covariances', 'velocities', 'sensor', 'orientations',
-    'orientation_covariances',
+    'orientation_covariances', 'kinds',
 )  # fmt: skip
 _PLANAR_VELOCITY = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
 _PLANAR_POINT = np.array([1.0, 1.0, 0.0])

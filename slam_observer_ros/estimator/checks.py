@@ -21,6 +21,7 @@ from slam_observer_ros.common.types import (
 from slam_observer_ros.estimator.event_warnings import EventWarnings, listed
 from slam_observer_ros.events import (
     AngularVelocityEvent,
+    AZIMUTH_RANGE,
     Event,
     flatten,
     IMPOSSIBLE_ID,
@@ -52,6 +53,9 @@ NEARLY = 1.0 - 1e-9
 
 SECTORS = 12
 """Directions about the vertical axis in each of which the nearest points are used first."""
+
+HALVES = range(AZIMUTH_RANGE + 1)
+"""Kinds of points, whole and half ones."""
 
 _INTEGERS = (int, np.int64)
 _FLOAT64 = np.dtype(np.float64)
@@ -275,6 +279,10 @@ def _check_observation(event: ObservationEvent) -> None:
         _check_coordinates('landmark velocities', event.velocities, (m, 3))
     if event.sensor is not None:
         _check_coordinates("sensor's positions", event.sensor, (m, 3))
+    if event.kinds is not None:
+        _check_array('kinds of points', event.kinds, (m,))
+        if event.kinds.dtype.kind != 'i' or not np.isin(event.kinds, HALVES).all():
+            raise InvalidEventError('wrong_type', f'a kind of point is none of {list(HALVES)}')
 
 
 def _check_orientations(event: ObservationEvent) -> None:

@@ -36,10 +36,11 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityBlock,
 )
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.landmark_map import heights_of, LandmarkMap
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import checked, table
+from slam_observer_ros.state.half_points import HalfPoints, judged
 
 logger = logging.getLogger(__name__)
 
@@ -83,6 +84,7 @@ class Estimator(Estimate):
         self._on_update, self._on_stamps = on_update, on_stamps
         self._on_motion, self._on_jump = on_motion, on_jump
         self._loop_closure = LoopClosure()
+        self._half_points = HalfPoints(self._counts)
         self.reset(initial_pose)
         self._warnings.unused_settings(settings, self._state.gains)
 
@@ -141,6 +143,7 @@ class Estimator(Estimate):
         right; nothing is changed then.
         """
         maps = usable_maps(landmark_map)
+        self._half_points.heights_m = heights_of(maps)
         if self.settings.localization_mode == 'off':
             largest = max(len(known.ids) for known in maps)
             self._warnings.loaded_map(largest, self.settings.max_landmarks)
@@ -320,13 +323,15 @@ class Estimator(Estimate):
 
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings
+        if self.settings.two_d_mode:
+            event = self._half_points.levelled(event)
         usable = usable_points(
             event, self.settings, state.gains, state.landmarks, self._counts, warnings
         )
-        event = self._timeline.synchronise(usable)
+        event = self._half_points.completed(self._timeline.synchronise(usable), self._state)
         if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
             self._placement.doubt(*self.uncertain_pose)
-        update = self._hypotheses.observe(event)
+        update = judged(self._hypotheses.observe(event), event, self._state)
         self._timeline.judge_standing(event, update)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
@@ -344,7 +349,10 @@ class Estimator(Estimate):
         Return whether that may have moved the robot.
         """
         if self._localiser.maps:
+            was_localised = self._localiser.is_localised
             self._placement.localise(event, update)
+            if self._localiser.is_localised != was_localised:
+                self._half_points.clear()
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
             is_alone = len(self._hypotheses) == 1
@@ -378,6 +386,7 @@ class Estimator(Estimate):
     def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""
         settings = self.settings
+        self._half_points.clear()
         self._queue = EventQueue(
             window_ns=to_ns(settings.reorder_window),
             max_jump_ns=to_ns(settings.max_stamp_jump),

@@ -19,6 +19,8 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 
+_TINY = np.finfo(np.float64).tiny
+
 
 @dataclass(frozen=True, slots=True)
 class Sensed:
@@ -70,3 +72,16 @@ def turning(values: FloatArray) -> FloatArray:
     turns = np.zeros((*values.shape[:-1], 3, 7))
     turns[..., :3] = so3.left_jacobian(values[..., :3])
     return turns
+
+
+def directions_of(lines: FloatArray) -> FloatArray:
+    """Return unit vectors (m, 3, 3) along lines of sight, in azimuth and in elevation, as rows."""
+    lengths = np.linalg.norm(lines, axis=1, keepdims=True)
+    along = np.where(lengths > 0.0, lines / np.maximum(lengths, _TINY), [1.0, 0.0, 0.0])
+    level = np.hypot(along[:, 0], along[:, 1])
+    flat = np.maximum(level, _TINY)
+    azimuth = np.column_stack([-along[:, 1] / flat, along[:, 0] / flat, np.zeros(len(lines))])
+    azimuth[level < _TINY**0.5] = [0.0, 1.0, 0.0]
+    elevation = np.cross(along, azimuth)
+    directions: FloatArray = np.stack([along, azimuth, elevation], axis=1)
+    return directions

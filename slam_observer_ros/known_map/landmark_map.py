@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any
@@ -204,3 +205,15 @@ def _ranges(first: IntArray, counts: IntArray) -> IntArray:
     before = np.cumsum(counts) - counts
     ranges: IntArray = np.arange(int(counts.sum())) + np.repeat(first - before, counts)
     return ranges
+
+
+def heights_of(maps: Iterable[LandmarkMap]) -> dict[int, float]:
+    """Return how high landmarks of maps in space are, metres, by id."""
+    return {
+        landmark_id: height_m
+        for known in maps
+        if not known.is_planar
+        for landmark_id, height_m in zip(
+            known.ids.tolist(), known.world_points[:, 2].tolist(), strict=True
+        )
+    }

@@ -23,7 +23,7 @@ static const double MAX_SPEED_ERRORS[2] = {50.0, 1000.0};
 static const double RESOLUTION_M = 1e-4;     /* observation_noise.py */
 static const double RELATIVE_RESOLUTION = 1e-6;
 static const double MAX_ERROR_M = 1e3;
-static const double MIN_SHARE = 1e-6;
+static const double MIN_SHARE = 1e-6, MOST_SHARE_M2 = 1e-6;
 static const double MIN_INTERVAL_S = 1e-3;
 static const double LOST = 1e-7;             /* matrices.py */
 static const double SUSPICION = 3.0;         /* robust.py */
@@ -700,7 +700,8 @@ static void point_covariance(const double line[3], const PointFigures *figures, 
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
             C[3 * i + j] = excess * line[i] * line[j];
-    add_to_diagonal(C, across + RESOLUTION_M * RESOLUTION_M + MIN_SHARE * (along + 2.0 * across));
+    const double share = MIN_SHARE * (along + 2.0 * across);
+    add_to_diagonal(C, across + RESOLUTION_M * RESOLUTION_M + fmin(share, MOST_SHARE_M2));
 }
 
 static int is_zero(const double C[9]) {
@@ -725,7 +726,7 @@ static void stated_covariance(const double y[3], const double stated[9], const d
             C[3 * i + j] = stated[3 * i + j] * scales[i] * scales[j];
     add_to_diagonal(C, RELATIVE_RESOLUTION * RELATIVE_RESOLUTION * dot3(y, y));
     double trace = C[0] + C[4] + C[8];
-    add_to_diagonal(C, RESOLUTION_M * RESOLUTION_M + MIN_SHARE * trace);
+    add_to_diagonal(C, RESOLUTION_M * RESOLUTION_M + fmin(MIN_SHARE * trace, MOST_SHARE_M2));
 }
 
 /* y = o + d + exp(psi) e^s p of a point, where its sensor was, and its stated covariance. */

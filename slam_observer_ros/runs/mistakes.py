@@ -54,7 +54,7 @@ DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
 MOST_S = 300.0
 """Time in all, at most."""
 
-SURE, CLEAR = 15.0, 0.1
+SURE, CLEAR = 25.0, 0.05
 """ln of how many times likelier all points must be, and each on average."""
 
 NOTABLE_TURN_RAD = 1.0

@@ -33,8 +33,11 @@ RESOLUTION_RAD = 1e-4
 MAX_ERROR_M = 1e3
 """Standard deviation of an observed point beyond which a message only says 'unknown'."""
 
-MIN_SHARE = 1e-6
-"""Least variance of an observed point in any direction, as a share of its total variance."""
+MIN_SHARE, MOST_SHARE_M2 = 1e-6, 1e-6
+"""Least variance of an observed point in any direction, as a share of its total variance.
+
+But no more than (1 mm)², as of a bearing whose depth may be anywhere within a kilometre.
+"""
 
 LASTING = 0.1
 """For which share of the time that a robot has stood its sensor's error is taken to last."""
@@ -168,7 +171,8 @@ def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
 
 def _invertible(covariances: FloatArray) -> FloatArray:
     """Return covariances (m, 3, 3) with no direction known exactly."""
-    least = RESOLUTION_M**2 + MIN_SHARE * covariances.trace(axis1=1, axis2=2)
+    shares = MIN_SHARE * covariances.trace(axis1=1, axis2=2)
+    least = RESOLUTION_M**2 + np.minimum(shares, MOST_SHARE_M2)
     invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
     return invertible
 
@@ -188,7 +192,8 @@ def point_covariances(lines_of_sight: FloatArray, figures: PointFigures) -> Floa
     scaled = excess[:, None] * lines_of_sight
     covariances: FloatArray = scaled[:, :, None] * lines_of_sight[:, None, :]
     # As of _invertible, but with the trace that is known.
-    least = RESOLUTION_M**2 + MIN_SHARE * (along + 2.0 * across)
+    shares = MIN_SHARE * (along + 2.0 * across)
+    least = RESOLUTION_M**2 + np.minimum(shares, MOST_SHARE_M2)
     covariances += (across + least)[:, None, None] * _IDENTITY
     return covariances
 

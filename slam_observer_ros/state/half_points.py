@@ -1,0 +1,229 @@
+"""Half points, bearings or ranges alone, completed to points that the step can use.
+
+A half point is a point once there is something to complete it with: of a known landmark by the
+estimate, at each observation, which is where the residual is linearised; of a new one by the past
+(:mod:`.waiting_room`). In the directions that were not measured a completed point may be off by
+``UNMEASURED_M``: its residual there is zero, and says nothing. So rows H = uᵀ of the measured
+directions and a completed point are the same correction, but for rounding.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.events import (
+    AZIMUTH,
+    AZIMUTH_RANGE,
+    BEARING,
+    ObservationEvent,
+    POINT,
+    RANGE,
+    UNKNOWN_ID,
+)
+from slam_observer_ros.geometry.sensor_mounting import directions_of
+from slam_observer_ros.sensor_models.observation_noise import point_covariances
+from slam_observer_ros.state.state import State
+from slam_observer_ros.state.waiting_room import sensor_values, WaitingRoom
+
+UNMEASURED_M = 1e3
+"""Standard deviation of a completed point where nothing was measured: as large as a message may
+state one."""
+
+MEASURED = np.array(
+    [
+        [True, True, True],
+        [False, True, True],
+        [True, False, False],
+        [False, True, False],
+        [True, True, False],
+    ]
+)
+"""Which of range, azimuth and elevation is measured, by kind."""
+
+LEAST_LEVEL = 0.1
+"""Cosine of the steepest line of sight, 84°, whose range says something in the plane."""
+
+_LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class HalfPoints:
+    """Completes what sensors measure, by a state and by the views that wait."""
+
+    def __init__(self, counts: Counter[str]) -> None:
+        self._counts = counts
+        self._waiting = WaitingRoom()
+        self.heights_m: Mapping[int, float] = {}  # of the landmarks of a loaded map
+
+    def clear(self) -> None:
+        """Forget the views that wait: time or frame are others."""
+        self._waiting = WaitingRoom()
+
+    def levelled(self, event: ObservationEvent) -> ObservationEvent:
+        """Return ranges in space as they are in the plane, where landmarks' heights are known."""
+        if event.kinds is None or not self.heights_m:
+            return event
+        lines = event.lines_of_sight
+        sensor_z = event.points[:, 2] - lines[:, 2]
+        known = [self.heights_m.get(landmark_id, math.nan) for landmark_id in event.ids.tolist()]
+        rise_m, range_m = np.array(known) - sensor_z, np.linalg.norm(lines, axis=1)
+        ranges_alone = (event.kinds == RANGE) & np.isfinite(rise_m) & (range_m > 0.0)
+        level = np.ones(len(lines))
+        share = np.clip(rise_m[ranges_alone] / range_m[ranges_alone], -1.0, 1.0)
+        level[ranges_alone] = np.maximum(np.sqrt(1.0 - share**2), LEAST_LEVEL)
+        covariances = event.covariances
+        if covariances is not None:
+            covariances = covariances / level[:, None, None] ** 2
+        points = event.points + (level - 1.0)[:, None] * lines
+        return replace(event, points=points, covariances=covariances)
+
+    def completed(self, event: ObservationEvent, state: State) -> ObservationEvent:
+        """Return an observation whose points are whole; those of which nothing is known wait."""
+        if event.kinds is None or not (event.kinds != POINT).any():
+            return event
+        # Zero residuals where nothing was measured would say that the motion is exact.
+        state.motion_noise.factors.forget_motion()
+        is_named = (event.ids != UNKNOWN_ID) | (event.kinds == POINT)
+        self._counts['unknown_id'] += int(np.count_nonzero(~is_named))
+        event = _with_sensor(state, event.select(is_named))
+        rows = state.landmarks.rows_of(event.ids)
+        lines, covariances = _completed(state, event, rows)
+        entered = np.zeros(len(rows), dtype=np.bool_)
+        if state.is_mapping:
+            is_new = (rows < 0) & (event.kinds != POINT)
+            for row in np.flatnonzero(is_new).tolist():
+                found = self._waiting.add(state, event, row, covariances[row])
+                if found is not None:
+                    lines[row], covariances[row] = found
+                    entered[row] = True
+        usable = (rows >= 0) | (event.kinds == POINT) | entered
+        self._counts['waiting_point'] += int(np.count_nonzero(~usable))
+        kinds = np.asarray(event.kinds)
+        kinds = np.where(entered, POINT, kinds)
+        points = event.points - event.lines_of_sight + lines
+        event = replace(event, points=points, covariances=covariances, kinds=kinds)
+        return event.select(usable)
+
+
+def judged(update: Update, event: ObservationEvent, state: State) -> Update:
+    """Return what came of a completed observation without the directions not measured."""
+    innovation = update.innovation
+    if event.kinds is None or innovation is None:
+        return update
+    k = state.axes.point
+    by_id = dict(zip(event.ids.tolist(), event.kinds.tolist(), strict=True))
+    kinds = np.array([by_id.get(each, POINT) for each in update.ids.tolist()], dtype=np.int64)
+    missing = k - measured_directions(kinds, k)
+    unmeasured = missing * (math.log(UNMEASURED_M) + _LOG_ROOT_2_PI)
+    used = innovation.weights > 0.0
+    degrees = innovation.degrees_of_freedom
+    return replace(
+        update,
+        innovation=replace(
+            innovation,
+            degrees_of_freedom=max(degrees - int(missing[used].sum()), 0) if degrees else 0,
+            log_densities=innovation.log_densities + unmeasured,
+        ),
+    )
+
+
+def measured_directions(kinds: IntArray, k: int) -> IntArray:
+    """Return how many directions (m,) of points in k dimensions are measured, by kind."""
+    count: IntArray = MEASURED[kinds][:, :k].sum(axis=1)
+    return count
+
+
+def _with_sensor(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Let a sensor whose calibration is estimated be known before it is asked for."""
+    calibration = state.calibration
+    if calibration.corrects_points and event.sensor_frame not in calibration.sensors:
+        state.add_sensor(event.sensor_frame)
+    return event
+
+
+def _completed(
+    state: State, event: ObservationEvent, rows: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return lines of sight (m, 3) as a sensor would have shown them, and their covariances.
+
+    Of landmarks that are not known, with what was measured alone.
+    """
+    shown, expected = event.lines_of_sight, event.lines_of_sight.copy()
+    known = rows >= 0
+    if known.any():
+        expected[known] = expected_lines(state, event.select(known), rows[known])
+    kinds = _of_axes(event.kinds, state)
+    lines = _combined(shown, expected, MEASURED[kinds])
+    return lines, _covariances(state, event, lines, kinds)
+
+
+def _of_axes(kinds: IntArray | None, state: State) -> IntArray:
+    """Return kinds as they are in the plane, too, where an azimuth is a whole direction."""
+    whole = {AZIMUTH: BEARING, AZIMUTH_RANGE: POINT} if state.axes.point == 2 else {}
+    all_kinds = np.asarray(kinds)
+    for azimuth, kind in whole.items():
+        all_kinds = np.where(all_kinds == azimuth, kind, all_kinds)
+    return all_kinds
+
+
+def expected_lines(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    """Return how a sensor would show landmarks ``rows`` (m,), by its calibration, body axes."""
+    R, shift, scale = sensor_values(state, event)
+    origins = event.points - event.lines_of_sight + shift
+    lines = state.observer.body_points(rows) - origins
+    if state.axes.point == 2:
+        lines[:, 2] = 0.0
+    shown: FloatArray = lines @ R / scale
+    return shown
+
+
+def _combined(shown: FloatArray, expected: FloatArray, measured: BoolArray) -> FloatArray:
+    """Return lines of sight (m, 3) of what is ``measured`` (m, 3), and of what is expected."""
+    measured_range, measured_azimuth, measured_elevation = measured.T
+    level = np.hypot(expected[:, 0], expected[:, 1])
+    source = np.where(measured_azimuth[:, None], shown, expected)
+    azimuth = np.arctan2(source[:, 1], source[:, 0])
+    rise = np.arctan2(expected[:, 2], level)
+    rise_shown = np.arctan2(shown[:, 2], np.hypot(shown[:, 0], shown[:, 1]))
+    elevation = np.where(measured_elevation, rise_shown, rise)
+    directions = np.column_stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    lengths = np.linalg.norm(np.where(measured_range[:, None], shown, expected), axis=1)
+    lines: FloatArray = lengths[:, None] * directions
+    return lines
+
+
+def _covariances(
+    state: State, event: ObservationEvent, lines: FloatArray, kinds: IntArray
+) -> FloatArray:
+    """Return covariances (m, 3, 3) of lines of sight: as measured, and anywhere else."""
+    noise = state.observation_noise
+    modelled = point_covariances(lines, noise.figures)
+    basis, lengths = directions_of(lines), np.linalg.norm(lines, axis=1)
+    variances = np.einsum('mij,mjk,mik->mi', basis, modelled, basis)
+    stated = event.covariances
+    if stated is not None:
+        own = directions_of(event.lines_of_sight)
+        of_shown = np.einsum('mij,mjk,mik->mi', own, stated, own)
+        # What is stated of a unit vector is an angle.
+        is_unit = ~MEASURED[kinds][:, 0]
+        of_shown[is_unit, 1:] *= lengths[is_unit, None] ** 2
+        is_stated = stated.any(axis=(1, 2))
+        variances[is_stated] = of_shown[is_stated]
+    variances = np.where(MEASURED[kinds], variances, UNMEASURED_M**2)
+    covariances: FloatArray = np.einsum('mij,mi,mik->mjk', basis, variances, basis)
+    if stated is not None:
+        whole = (kinds == POINT) & stated.any(axis=(1, 2))
+        covariances[whole] = stated[whole]
+    return covariances
