@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from estimators import EKF, ISAM2_DEFAULT
 
-from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.estimator.placement import DESIGNS
 
 CLEAN, OUTLIERS, LEFT_OUT, NO_IDS = 'accuracy', 'with_outliers', 'left_out', 'without_ids'
 FALSE_POINTS = 'false_points'

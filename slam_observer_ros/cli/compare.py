@@ -29,12 +29,12 @@ from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimator.placement import DESIGNS
 from slam_observer_ros.evaluation.drawing import SUFFIXES
 from slam_observer_ros.evaluation.map_plot import plot_overlay
 from slam_observer_ros.evaluation.metrics import trajectory_errors, TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import MAX_GAP_NS, read_tum, Trajectory
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, FIGURES, number_text, TRAJECTORY_ROWS

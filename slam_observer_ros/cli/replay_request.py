@@ -14,7 +14,7 @@ import numpy as np
 from slam_observer_ros.cli.options import Given, named, named_path, settings_of
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.observer.designs import make_gains
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.topics import SelectedTopics, TopicNames

@@ -323,15 +323,19 @@ class Estimator(Estimate):
 
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings
-        if self.settings.two_d_mode:
+        if event.kinds is not None and self.settings.two_d_mode:
             event = self._half_points.levelled(event)
         usable = usable_points(
             event, self.settings, state.gains, state.landmarks, self._counts, warnings
         )
-        event = self._half_points.completed(self._timeline.synchronise(usable), self._state)
+        event = self._timeline.synchronise(usable)
+        if event.kinds is not None:
+            event = self._half_points.completed(event, self._state)
         if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
             self._placement.doubt(*self.uncertain_pose)
-        update = judged(self._hypotheses.observe(event), event, self._state)
+        update = self._hypotheses.observe(event)
+        if event.kinds is not None:
+            update = judged(update, event, self._state)
         self._timeline.judge_standing(event, update)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late

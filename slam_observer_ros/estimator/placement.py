@@ -15,14 +15,27 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
-from slam_observer_ros.observer.designs import make_gains
-from slam_observer_ros.settings.estimator_settings import LiveSettings
+from slam_observer_ros.observer.constant import ConstantGains
+from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
+from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.state.state import State
 
 logger = logging.getLogger(__name__)
 
+DESIGNS: dict[str, type[Gains]] = {
+    'constant': ConstantGains,
+    'riccati': RiccatiGains,
+}
+"""The values of the parameter ``gains``, and what they are."""
+
 GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 """Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
+
+
+def make_gains(settings: Settings, reference_pose: FloatArray) -> Gains:
+    """Return what the setting ``gains`` names, at P° = ``reference_pose`` (4, 4)."""
+    return DESIGNS[settings.gains](settings, reference_pose)
 
 
 class Placement:

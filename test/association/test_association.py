@@ -21,12 +21,12 @@ from slam_observer_ros.association.joint_compatibility import (
 )
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, is_automatic
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.recording.data_sets import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings

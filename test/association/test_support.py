@@ -11,8 +11,8 @@ import pytest
 
 from slam_observer_ros.association.hypothesis import FieldOfView, Visibility
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM
 from slam_observer_ros.state.state import State

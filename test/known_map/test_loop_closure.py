@@ -11,10 +11,10 @@ from slam_observer_ros.association.assignments import find_assignments
 from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.loop_closure import LoopClosure
-from slam_observer_ros.observer.designs import make_gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.state import State

@@ -15,7 +15,7 @@ class TypeChoice:
     """Chooses the type that flows among those that are published on one topic.
 
     A topic can be heard with one type at a time. A publisher may be silent for ever, as a
-    teleoperation that nobody uses, so that being published does not tell which type flows.
+    teleoperation that nobody uses, so that being published does not show which type flows.
 
     Attributes
     ----------
