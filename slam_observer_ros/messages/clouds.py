@@ -7,7 +7,7 @@ Which fields a cloud has is known without decoding it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import (
+    BEARING,
+    IMPOSSIBLE_ID,
+    MAX_ID,
+    ObservationEvent,
+    POINT,
+    RANGE,
+    UNKNOWN_ID,
+)
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.registry import reads
 
@@ -24,6 +32,8 @@ ID_NAME = 'id'
 POINT_NAMES = ('x', 'y', 'z')
 COVARIANCE_NAMES = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
 VELOCITY_NAMES = ('vx', 'vy', 'vz')
+RANGE_NAME, RANGE_VARIANCE_NAME = 'range', 'range_variance'
+NO_RANGE_NAME = 'no_range'
 
 UNKNOWN_UINT32_ID = MAX_ID + 1
 """How an unknown id is written where ids are uint32: the same bits as -1."""
@@ -101,7 +111,10 @@ CLOUDS = ('sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/PointCloud')
 MAX_UNKNOWN_POINTS = 500
 """Most points without id in a message: associating them costs their number cubed."""
 
-_READ_NAMES = frozenset((ID_NAME, *POINT_NAMES, *COVARIANCE_NAMES, *VELOCITY_NAMES))
+_OF_HALF_POINTS = (RANGE_NAME, RANGE_VARIANCE_NAME, NO_RANGE_NAME)
+_READ_NAMES = frozenset(
+    (ID_NAME, *POINT_NAMES, *COVARIANCE_NAMES, *VELOCITY_NAMES, *_OF_HALF_POINTS)
+)
 _UPPER_TRIANGLE_TO_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 
 _NUMPY_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -116,9 +129,11 @@ def decode_point_cloud2(reader: CdrReader) -> ObservationEvent:
 
     ``id`` gives the landmark ids, ``UNKNOWN_ID`` where it holds -1 (2³² - 1 if unsigned) or is
     missing; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per point in the axes of
-    the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s. Points that weren't
-    measured, which are NaN or infinite, are left out, whatever id they have, and whether or not
-    the cloud claims to be dense.
+    the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s. A cloud without x, y, z
+    but with ``range`` is of distances alone, m, with ``range_variance``, m², if it has that; where
+    ``no_range`` is not zero x, y, z are a direction of any length. Points that weren't measured,
+    which are NaN or infinite, are left out, whatever id they have, and whether or not the cloud
+    claims to be dense.
     """
     stamp_ns, frame_id = reader.header()
     height, width = reader.uint32(), reader.uint32()
@@ -189,7 +204,7 @@ def _record_type(
                 f'field {field.name} is no single number: datatype {field.datatype}, '
                 f'count {field.count}'
             )
-        if field.name != ID_NAME and field.datatype < POINT_FIELD_FLOAT32:
+        if field.name not in (ID_NAME, NO_RANGE_NAME) and field.datatype < POINT_FIELD_FLOAT32:
             raise MessageError(f'field {field.name} is not of type FLOAT32 or FLOAT64')
         numpy_type = byte_order + _NUMPY_TYPES[field.datatype]
         if field.offset + np.dtype(numpy_type).itemsize > point_step:
@@ -207,8 +222,11 @@ def _record_type(
 
 
 def _require_whole_groups(names: set[str]) -> None:
+    has_ranges = RANGE_NAME in names and not names.intersection(POINT_NAMES)
+    if has_ranges and ID_NAME not in names:
+        raise MessageError('missing field id: a distance alone is used of known transmitters only')
     for group, optional in (
-        (POINT_NAMES, False),
+        (POINT_NAMES, has_ranges),
         (COVARIANCE_NAMES, True),
         (VELOCITY_NAMES, True),
     ):
@@ -229,6 +247,8 @@ def _check_size(size: int, height: int, width: int, point_step: int, row_step: i
 
 
 def _observation(stamp_ns: int, frame_id: str, records: Records) -> ObservationEvent:
+    if POINT_NAMES[0] not in _names(records):
+        return _ranges(stamp_ns, frame_id, records)
     points = _columns(records, POINT_NAMES)
     measured = is_measured(points)
     if not measured.all():  # The other fields of such points may hold anything.
@@ -240,9 +260,36 @@ def _observation(stamp_ns: int, frame_id: str, records: Records) -> ObservationE
             covariances = upper_triangles[:, _UPPER_TRIANGLE_TO_MATRIX].reshape(-1, 3, 3)
     if VELOCITY_NAMES[0] in _names(records):
         velocities = _columns(records, VELOCITY_NAMES)
-    return ObservationEvent(
+    event = ObservationEvent(
         stamp_ns, _ids(records), points, covariances, velocities, sensor_frame=frame_id
     )
+    if NO_RANGE_NAME not in _names(records):
+        return event
+    are_directions = records[NO_RANGE_NAME].ravel() != 0
+    lengths = np.linalg.norm(points, axis=1)
+    points[are_directions] /= np.maximum(lengths, np.finfo(np.float64).tiny)[are_directions, None]
+    kinds = np.where(are_directions, BEARING, POINT)
+    return replace(event, kinds=kinds).select(~are_directions | (lengths > 0.0))
+
+
+def _ranges(stamp_ns: int, frame_id: str, records: Records) -> ObservationEvent:
+    """Return distances alone: in which direction the event has them says nothing."""
+    names = [name for name in (RANGE_NAME, RANGE_VARIANCE_NAME) if name in _names(records)]
+    columns = _columns(records, tuple(names))
+    points, covariances = np.zeros((len(columns), 3)), None
+    points[:, 0] = columns[:, 0]
+    if len(names) > 1 and columns[:, 1].any():
+        covariances = np.zeros((len(columns), 3, 3))
+        covariances[:, 0, 0] = columns[:, 1]
+    event = ObservationEvent(
+        stamp_ns,
+        _ids(records),
+        points,
+        covariances,
+        sensor_frame=frame_id,
+        kinds=np.full(len(columns), RANGE),
+    )
+    return event.select(is_measured(points) & (points[:, 0] > 0.0))
 
 
 def _names(records: Records) -> tuple[str, ...]:
