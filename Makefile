@@ -83,7 +83,7 @@ develop: $(READY_TO_DEVELOP)  ## add to it what lint and tests need
 lock: $(READY_TO_DEVELOP)  ## write requirements*.lock, the hashes of what constraints.txt names
 	$(PYTHON_IN_VENV) -m pip install --quiet uv
 	$(LOCK) --extra cli --extra ros-jazzy --output-file requirements.lock setup.py
-	$(LOCK) --extra cli --extra cluster --extra rerun --extra test --extra dev --extra ros-jazzy \
+	$(LOCK) --extra cli --extra cluster --extra test --extra dev --extra ros-jazzy \
 		--output-file requirements-develop.lock setup.py
 
 $(READY): setup.py constraints.txt requirements.lock \

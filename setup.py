@@ -76,7 +76,6 @@ setup(
             ]
             for ros in ROS_RELEASES
         },
-        'rerun': ['rerun-sdk>=0.41; python_version >= "3.11"'],  # replay --rerun
         'test': [
             'pytest',  # named in this extra, it is what `colcon test` runs
             'pytest-timeout',  # a ROS test that hangs must fail

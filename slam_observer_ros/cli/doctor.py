@@ -48,7 +48,6 @@ OPTIONAL_PACKAGES = {
     'matplotlib': 'figures',
     'rich': 'tables in the terminal',
     'argcomplete': 'completion in the shell',
-    'rerun-sdk': 'replay --rerun',
 }
 
 

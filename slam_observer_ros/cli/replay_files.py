@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 import dataclasses
-from importlib.util import find_spec
 import logging
 from pathlib import Path
 
@@ -35,9 +34,6 @@ from slam_observer_ros.runs.reported_run import Replay
 logger = logging.getLogger(__name__)
 
 FIGURES = ('map', 'errors', 'residuals')
-
-VIEWER = False
-"""What is given to ``--rerun`` in place of a file to have the viewer opened."""
 
 MAX_ELLIPSES = 300
 """Landmarks of more would hide each other's, and their joint covariance costs the cube of them."""
@@ -69,24 +65,7 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
     outputs.add_argument(
         '--with-inputs', action='store_true', help='--mcap has the messages that came in, too'
     )
-    outputs.add_argument(
-        '--rerun',
-        nargs='?',
-        type=_rerun_file,
-        const=VIEWER,
-        metavar='OUT.rrd',
-        help='a file for Rerun, or its viewer if no file is given (needs rerun-sdk)',
-    )
     add_result_options(outputs, FIGURES)
-
-
-def _rerun_file(text: str) -> Path:
-    path = Path(text)
-    if path.suffix != '.rrd':
-        raise argparse.ArgumentTypeError(
-            f"files for Rerun are .rrd files, so not '{text}'; without one give --rerun last"
-        )
-    return path
 
 
 def records_of(args: argparse.Namespace) -> Records:
@@ -94,7 +73,7 @@ def records_of(args: argparse.Namespace) -> Records:
     return Records(
         poses=args.tum is not None,
         nis=args.json,
-        whole_run=any(output is not None for output in (args.report, args.plot, args.rerun)),
+        whole_run=any(output is not None for output in (args.report, args.plot)),
         map=args.map is not None,
         mcap=args.mcap,
         with_inputs=args.with_inputs,
@@ -110,20 +89,13 @@ def check_files(args: argparse.Namespace, config: Path | None) -> None:
     if config is not None:
         read['the file of --config'] = [config]
     loaded = {} if args.load_map is None else {'the file of --load-map': map_files(args.load_map)}
-    files = {
-        '--tum': args.tum,
-        '--report': args.report,
-        '--mcap': args.mcap,
-        '--rerun': args.rerun or None,
-    }
+    files = {'--tum': args.tum, '--report': args.report, '--mcap': args.mcap}
     figures = () if args.plot is None else figure_files(args, FIGURES)
     drawn = {f'{name} of --plot,': args.plot / name for name in figures}
     check_inputs_are_kept(files | drawn, read | loaded)
     check_inputs_are_kept({'--map': args.map}, read)
     outputs = [args.map, *files.values()]
     check_outputs(outputs, args.force)
-    if args.rerun is not None and find_spec('rerun') is None:
-        raise UsageError("--rerun needs rerun-sdk: 'pip install rerun-sdk'")
     check_plots(args, FIGURES, outputs)
 
 
@@ -136,11 +108,6 @@ def write_files(
         ('trajectory', args.tum, lambda path: write_tum(outcome.trajectory, path)),
         ('map', args.map, lambda path: _write_map(outcome, map_frame, path)),
         ('report', args.report, lambda path: write_report_of(title, outcome, summary, path)),
-        (
-            'Rerun file',
-            args.rerun or None,
-            lambda path: _show_in_rerun(title, outcome, path),
-        ),
         ('figures', args.plot, lambda path: _draw(args, outcome, path)),
     )
     written: dict[str, Path] = {} if args.mcap is None else {'recording': args.mcap}
@@ -153,8 +120,6 @@ def write_files(
             written[name] = path
         except (SlamObserverError, OSError) as error:
             errors.append(str(error))
-    if args.rerun is VIEWER:
-        _show_in_rerun(title, outcome, None)
     return written, errors
 
 
@@ -183,13 +148,6 @@ def write_report_of(
     logged = {finding.text() for finding in outcome.findings}
     warnings = [warning for warning in outcome.warnings if warning not in logged]
     write_report(path, outcome.shown, title, summary, outcome.findings, warnings)
-
-
-def _show_in_rerun(title: str, outcome: ReplayOutcome, path: Path | None) -> None:
-    """Write a file for Rerun, or open its viewer if that is None."""
-    from slam_observer_ros.report.rerun_log import show_in_rerun  # which only some have
-
-    show_in_rerun(outcome.shown, title, path)
 
 
 def _draw(args: argparse.Namespace, outcome: ReplayOutcome, directory: Path) -> None:
