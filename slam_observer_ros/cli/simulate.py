@@ -31,7 +31,7 @@ from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import Decay, fit_decay
 from slam_observer_ros.evaluation.trajectory import PoseTruth, Trajectory
-from slam_observer_ros.observer.constant import lyapunov
+from slam_observer_ros.observer.observer import lyapunov
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.sampling import PoseSamples
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -32,6 +32,7 @@ from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublis
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
 from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
 from slam_observer_ros.nodes.ros_interface import read_settings
+from slam_observer_ros.runs.mistakes import Search
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -84,7 +85,7 @@ class DataFlow:
             on_jump=self._forget_time,
             judges_innovations=True,
         )
-        self.watch = MistakeWatch(node, self.estimator)
+        self.watch = MistakeWatch(node, self.estimator, Search)
         self.buffer = TransformBuffer()
         self.output = EstimatePublisher(node, settings, self.estimator, self.buffer)
         self._transforms = LiveTransforms(

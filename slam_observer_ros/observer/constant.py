@@ -8,10 +8,6 @@ residuals r_i (m, 3), J_i = [−[e_i]×, I], g = Σ k_i J_iᵀ r_i and H = Σ k_
 
 one Gauss–Newton step for dt → ∞, and down the same L as the paper's Δ dt for dt → 0. The landmarks
 close the share 1 − e^{−(l/k) dt} of what remains. See docs/theory.md, Discrete time.
-
-At the end are (28)–(31) in continuous time, and the Lyapunov function that they lower: tests hold
-gains against them. Signs are put right: as printed, (30) has no minus and (31) has one too many,
-and L grows. They follow from ė_i = Δ e_i + Δ â_i − δ_i, for which (35) holds.
 """
 
 from __future__ import annotations
@@ -25,7 +21,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
 from slam_observer_ros.observer.gains import Gains
-from slam_observer_ros.observer.observer import Residuals
+from slam_observer_ros.observer.observer import lyapunov, Residuals
 from slam_observer_ros.sensor_models.calibration import SENSOR_STDDEVS, VELOCITY_STDDEVS
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
@@ -36,7 +32,7 @@ class ConstantGains(Gains):
     """Constant gains k (30) and l (31), the same for every landmark.
 
     The ``step_mode`` 'paper' turns about the reference's origin with the metric of (10), and so
-    converges to the paper's equation (:func:`innovation`) for dt → 0; 'exponential' turns
+    converges to the paper's equation (:func:`.innovation`) for dt → 0; 'exponential' turns
     about the centroid of the e_i, where rotation and translation do not compete. In
     ``two_d_mode`` all turns are about z.
     """
@@ -135,31 +131,3 @@ def _held_time(rates: FloatArray, dt_s: float) -> FloatArray:
     """Return (1 − e^{−λ dt})/λ for ``rates`` λ in 1/s, and its limit dt at λ = 0."""
     positive = np.maximum(rates, np.finfo(float).tiny)
     return np.where(rates > 0.0, -np.expm1(-positive * dt_s) / positive, dt_s)
-
-
-def innovation(
-    gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray, a: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return (Δ, δ_i): Δ (4, 4) in se(3) moves the pose, δ_i (m, 3) in m/s the landmarks."""
-    Delta = -se3.project(_outer_sum(gain_k, e, r))  # (30)
-    delta = a @ Delta[:3, :3].T + (gain_l / gain_k)[:, None] * r  # (31)
-    return Delta, delta
-
-
-def lyapunov(gain_k: FloatArray | float, r: FloatArray) -> float:
-    """Return L = Σ k_i/2 |r_i|² (34)."""
-    return float(0.5 * np.vdot(gain_k * r.T, r.T))
-
-
-def lyapunov_rate(gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray) -> float:
-    """Return dL/dt = −‖P(Σ k_i r_i ē_iᵀ)‖² − Σ l_i |r_i|² under the innovation (35)."""
-    projection = se3.project(_outer_sum(gain_k, e, r))
-    return float(-np.sum(projection**2) - np.sum(gain_l * np.sum(r * r, axis=-1)))
-
-
-def _outer_sum(k: FloatArray, e: FloatArray, r: FloatArray) -> FloatArray:
-    """Return Σ k_i r_i ē_iᵀ (4, 4), with r_i a direction and ē_i = (e_i, 1) a point."""
-    M = np.zeros((4, 4))
-    M[:3, :3] = np.einsum('i,ij,ik->jk', k, r, e)
-    M[:3, 3] = k @ r
-    return M

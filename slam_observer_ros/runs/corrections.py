@@ -1,4 +1,7 @@
-"""Which mistakes of a set-up there are: what each makes right again, and what else it explains."""
+"""Which mistakes of a set-up there are: what makes each right again, and what else it explains.
+
+And by which part of a drive they are judged.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,15 @@ from typing import Any
 import numpy as np
 
 from slam_observer_ros.common.findings import Finding
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 
@@ -167,3 +177,77 @@ def explained(findings: Iterable[Finding]) -> list[Finding]:
     findings = list(findings)
     names_one = any(each.kind in MISTAKES for each in findings)
     return [each for each in findings if not names_one or each.kind not in SYMPTOMS]
+
+
+DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
+"""Time of driving, and turns, that are looked at: who stands or goes straight on says little."""
+
+MOST_S = 300.0
+"""Time in all, at most."""
+
+
+def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
+    """Return the events until the robot has driven for DRIVE_S, with points that have ids.
+
+    Or until a ``part`` of that.
+    """
+    kept: list[Event] = []
+    drive, first_ns = _Drive(), None
+    for event in events:
+        first_ns = event.stamp_ns if first_ns is None else first_ns
+        is_enough = drive.driven_s > part * DRIVE_S and drive.turned_rad > part * TURNED_RAD
+        if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
+            break
+        if isinstance(event, ObservationEvent):
+            kept.append(event.select(event.ids != UNKNOWN_ID))
+            continue
+        kept.append(event)
+        if isinstance(event, VelocityEvent):
+            drive.add(event)
+    return kept
+
+
+def driven_s(events: Iterable[Event]) -> float:
+    """Return for how long the robot drives in all, seconds."""
+    return _driven(events).driven_s
+
+
+def turned(events: Iterable[Event]) -> float:
+    """Return by how much the velocities turn the robot in all, radians if they are in rad/s."""
+    return _driven(events).turned_rad
+
+
+class _Drive:
+    """Sums up the velocities; one that is held for more than a second says nothing any more."""
+
+    def __init__(self) -> None:
+        self.driven_s, self.turned_rad = 0.0, 0.0
+        self._last: VelocityEvent | None = None
+
+    def add(self, event: VelocityEvent) -> None:
+        if self._last is not None and self._last.body_velocity.any():
+            held_s = min(to_s(max(event.stamp_ns - self._last.stamp_ns, 0)), 1.0)
+            self.driven_s += held_s
+            self.turned_rad += held_s * float(np.linalg.norm(self._last.body_velocity[:3]))
+        self._last = event
+
+
+def _driven(events: Iterable[Event]) -> _Drive:
+    drive = _Drive()
+    for event in events:
+        if isinstance(event, VelocityEvent):
+            drive.add(event)
+    return drive
+
+
+def never_turns(events: Iterable[Event]) -> bool:
+    """Return whether the robot drives, and all its angular velocities are exactly zero."""
+    drives = False
+    for event in events:
+        if isinstance(event, AngularVelocityEvent) and event.angular_velocity.any():
+            return False
+        if isinstance(event, VelocityEvent):
+            if event.body_velocity[:3].any():
+                return False
+            drives |= bool(event.body_velocity.any())
+    return drives

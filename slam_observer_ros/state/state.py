@@ -12,9 +12,9 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import NormalisedInnovation, Smoothed, Update
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
-from slam_observer_ros.observer.constant import lyapunov
 from slam_observer_ros.observer.gains import Errors, Gains
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.observer import lyapunov
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise

@@ -13,6 +13,7 @@ from robots import Robot
 
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
+from slam_observer_ros.runs.mistakes import Search
 
 SLIP = [found('slip')]
 
@@ -20,7 +21,7 @@ SLIP = [found('slip')]
 def watch(events):
     """Return a watch that has seen events, and its node."""
     node = Mock()
-    watched = MistakeWatch(node, SimpleNamespace(settings=SETTINGS, loaded_maps=()))
+    watched = MistakeWatch(node, SimpleNamespace(settings=SETTINGS, loaded_maps=()), Search)
     for event in events:
         watched.note(event)
     return watched, node

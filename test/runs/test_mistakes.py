@@ -11,8 +11,8 @@ import pytest
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.runs.corrections import explained
-from slam_observer_ros.runs.mistakes import first_drive, mistakes
+from slam_observer_ros.runs.corrections import explained, first_drive
+from slam_observer_ros.runs.mistakes import mistakes
 
 
 def named(events, settings=SETTINGS):

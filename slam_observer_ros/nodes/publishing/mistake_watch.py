@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 import time
+from typing import Protocol, TypeAlias
 
 from rclpy.node import Node
 
@@ -12,8 +13,9 @@ from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.events import Event
-from slam_observer_ros.runs.corrections import SUSPICIOUS
-from slam_observer_ros.runs.mistakes import driven_s, Search
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.runs.corrections import driven_s, SUSPICIOUS
+from slam_observer_ros.settings.estimator_settings import Settings
 
 WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000
 """Time, and events, of late that are looked at."""
@@ -28,6 +30,18 @@ PAUSE_S = 60.0
 """Time between two searches: before, most of the events are the same."""
 
 
+class Search(Protocol):
+    """Looks for mistakes of a set-up, a part at a time (``runs/mistakes.py``)."""
+
+    findings: list[Finding]
+
+    def advance(self, seconds: float) -> bool:
+        """Go on for some time; return whether ``findings`` are known."""
+
+
+Begin: TypeAlias = Callable[[Settings, Sequence[Event], Sequence[LandmarkMap] | None], Search]
+
+
 class MistakeWatch:
     """Keeps the events of late, and searches them for a mistake while there is reason for that.
 
@@ -40,10 +54,10 @@ class MistakeWatch:
 
     """
 
-    def __init__(self, node: Node, estimator: Estimate) -> None:
+    def __init__(self, node: Node, estimator: Estimate, begin_search: Begin) -> None:
         self.findings: list[Finding] = []
         self._node = node
-        self._estimator = estimator
+        self._estimator, self._begin_search = estimator, begin_search
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._search: Search | None = None
         self._next_s = 0.0
@@ -68,7 +82,9 @@ class MistakeWatch:
         is_suspicious = has_slipped or any(each.kind in SUSPICIOUS for each in findings)
         if (is_suspicious or self.findings) and driven_s(self._events) > LEAST_DRIVEN_S:
             maps = self._estimator.loaded_maps
-            self._search = Search(self._estimator.settings, list(self._events), maps or None)
+            self._search = self._begin_search(
+                self._estimator.settings, list(self._events), maps or None
+            )
             self.timer.reset()
 
     def _advance(self) -> None:
