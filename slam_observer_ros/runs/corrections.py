@@ -125,7 +125,8 @@ CORRECTIONS = (
 MISTAKES = frozenset({'no_turning', *(each.kind for each in CORRECTIONS)})
 """Kinds of finding that name a mistake of the set-up."""
 
-ALIKE = ({'points_mirrored', 'turning_negated'}, {'points_backwards', 'driving_negated'})
+MIRRORED = {'points_mirrored', 'turning_negated'}
+ALIKE = (MIRRORED, {'points_backwards', 'driving_negated'})
 """Mirror images of each other, and what differs by which end of the robot is its front."""
 
 PAIRS = tuple(

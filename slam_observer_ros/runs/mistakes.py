@@ -36,6 +36,7 @@ from slam_observer_ros.runs.corrections import (
     CORRECTIONS,
     first_drive,
     IN_DEGREES,
+    MIRRORED,
     never_turns,
     PAIRS,
     SIZED,
@@ -163,7 +164,9 @@ def _best(
     for each in [score.correction for score in tried[-TRIED:]]:
         score = yield from _score(settings, events, each, known)
         is_better = score.is_clearly_better(as_sized if each.changes else before)
-        if is_better and score.mean > best.mean:
+        # In a frame of its own, where no map contradicts it, nothing is compared with the map.
+        is_in_map = known is None or score.localised_share > max(0.0, before.localised_share - 0.1)
+        if is_better and is_in_map and score.mean > best.mean:
             best = score
     if best.correction.kind == 'tag_size':
         sized = yield from _sized(settings, events, best.correction, known)
@@ -190,8 +193,9 @@ def _findings(corrections: Iterable[Correction], known: Maps | None) -> list[Fin
             by = 'the wheels' if known is None else 'the map'
             findings.append(found('tag_size', factor=each.scale(), by=by))
         else:
-            # What a map alone sets apart
-            alike = [kinds for kinds in ALIKE if each.kind in kinds and known is None]
+            # Mirror images are what a map alone sets apart.
+            alike = [kinds for kinds in ALIKE if each.kind in kinds]
+            alike = [kinds for kinds in alike if known is None or kinds != MIRRORED]
             findings += [found(kind) for kind in sorted(*alike or [{each.kind}])]
     return findings
 
@@ -211,6 +215,7 @@ class _Score:
     turned_rad: float  # at most since the start, as it is seen
     scale: float  # of the wheels
     range_scale: float
+    localised_share: float  # of the observations, in a loaded map
 
     def is_clearly_better(self, other: _Score) -> bool:
         """Return whether points are much likelier by this one."""
@@ -234,10 +239,12 @@ def _score(
         if isinstance(each, ObservationEvent)
     )
     recorder, attitudes = LikelihoodRecorder(k, scale * reach), [np.eye(3)]
+    localised: list[bool] = []
 
     def note_update(update: Update) -> None:
         recorder.note_update(update)
         attitudes.append(update.pose[:3, :3])
+        localised.append(estimator.is_localised)
 
     estimator = Estimator(settings, on_update=note_update, judges_innovations=True)
     if known is not None:
@@ -258,4 +265,5 @@ def _score(
         float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
         found_out.get('linear_scale_x', 1.0),
         found_out.get('range_scale', 1.0),
+        sum(localised) / max(len(localised), 1),
     )

@@ -261,7 +261,9 @@ class AnotherClock:
         self.node.resolve_topic_name = lambda name: f'/{name.lstrip("/")}'
         self.estimator = Estimator(Settings(reorder_window=0.0))
         base_frame = BaseFrame(settings, self.transforms)
-        self.feed = EstimatorFeed(self.node, settings, self.estimator, base_frame, Mock(), Mock())
+        self.feed = EstimatorFeed(
+            self.node, settings, self.estimator, base_frame, Mock(), Mock(), Mock()
+        )
         self.feed.is_active = True
 
     def send(self, received_ns):

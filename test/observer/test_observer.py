@@ -14,14 +14,11 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.constant import (
     centroid_step,
     ConstantGains,
-    innovation,
-    lyapunov,
-    lyapunov_rate,
     paper_step,
     safe_step,
 )
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.observer import innovation, lyapunov, lyapunov_rate, Observer
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PAPER_LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 0], [0, 4, 0], [0, -4, 0]])

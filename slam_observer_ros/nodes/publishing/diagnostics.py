@@ -143,8 +143,15 @@ class DiagnosticsPublisher:
         return self._estimator.dropped + self._feed.dropped + shed
 
     def _findings(self, dropped: Counter[str], new: Counter[str]) -> list[Finding]:
-        """Judge what came and what is estimated, the inputs of which nothing was used first."""
-        findings = []
+        """Judge where the robot is, what came, and what is estimated."""
+        findings: list[Finding] = []
+        if not self._estimator.is_localised:
+            findings.append(found('unknown_pose'))
+            # Landmarks that came without an id have one that was given here.
+            estimator = self._estimator
+            problem = estimator.localisation_problem
+            if is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses):
+                findings += [problem] if problem else []
         if dropped:  # what came while the node was paused or inactive was not to be used
             findings += [found_so for source in self._inputs for found_so in self._of_use(source)]
         findings += [
@@ -167,13 +174,6 @@ class DiagnosticsPublisher:
         if recent['observed_point'] >= MIN_POINTS:
             findings += of_rejections(recent, 'seen lately ')
         findings += of_velocity(self._estimator) + of_estimate(self._estimator)
-        if not self._estimator.is_localised:
-            findings.append(found('unknown_pose'))
-            # Landmarks that came without an id have one that was given here.
-            estimator = self._estimator
-            problem = estimator.localisation_problem
-            if is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses):
-                findings += [problem] if problem else []
         return findings
 
     def _faults(self) -> list[str]:
