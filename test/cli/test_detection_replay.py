@@ -83,6 +83,21 @@ def markers(build, seen):
     return build(found, CAMERA_FRAME, seen.stamp_ns)
 
 
+def landmark_list(seen):
+    found = [
+        (str(number), point, detector.NO_TURN)
+        for number, point in zip(seen.ids, seen.points, strict=True)
+    ]
+    return detector.landmark_list(found, CAMERA_FRAME, seen.stamp_ns)
+
+
+def range_bearing(seen):
+    x, y, z = seen.points.T
+    ranges, yaws, level = np.linalg.norm(seen.points, axis=1), np.arctan2(y, x), np.hypot(x, y)
+    sensed = zip(seen.ids.tolist(), ranges, yaws, np.arctan2(-z, level), strict=True)
+    return detector.range_bearing(sensed, CAMERA_FRAME, seen.stamp_ns)
+
+
 MESSAGES = {
     '/landmarks': cloud,
     '/nameless': lambda seen: cloud(seen, ids=-1),
@@ -92,6 +107,8 @@ MESSAGES = {
     '/aruco_detections': partial(markers, detector.aruco_detection),
     '/aruco_markers': partial(markers, detector.aruco_markers),
     '/tag_detections': partial(markers, detector.isaac_apriltags),
+    '/landmark_list': landmark_list,
+    '/range_bearing': range_bearing,
     '/tf': lambda seen: tags(seen, 'tag36h11:'),
     '/tags/tf': lambda seen: tags(seen, 'dock'),
 }
@@ -135,6 +152,8 @@ def recordings(tmp_path_factory):
         'aruco_opencv': ['/aruco_detections'],
         'ros2_aruco': ['/aruco_markers', '/poses'],
         'isaac': ['/tag_detections'],
+        'cartographer': ['/landmark_list'],
+        'mrpt': ['/range_bearing'],
         'two': ['/detections', '/boxes'],
         'unplaced': ['/detections'],
     }
@@ -177,6 +196,10 @@ def assert_same(actual, expected):
         ('ros2_aruco', ()),
         ('ros2_aruco', ('--set', 'landmarks_type=ArucoMarkers')),
         ('isaac', ()),
+        ('cartographer', ()),
+        ('cartographer', ('--set', 'landmarks_type=LandmarkList')),
+        ('mrpt', ()),
+        ('mrpt', ('--set', 'landmarks_type=ObservationRangeBearing')),
         ('isaac', ('--set', 'landmarks_type=AprilTagDetectionArray')),
         ('all', ('--landmarks-topic', '/detections')),
         ('all', ('--landmarks-topic', '/tags/tf', '--tag-frame-prefix', 'dock')),

@@ -130,3 +130,35 @@ def isaac_apriltags(
         tag = 'tag36h11', number, pixel, [pixel] * 4, stamped
         seen.append(ros.make(f'{package}/AprilTagDetection', *tag))
     return ros.make(f'{package}/AprilTagDetectionArray', header, seen)
+
+
+def landmark_list(
+    entries: Iterable[tuple[str, Sequence[float], Sequence[float]]],
+    frame_id: str,
+    stamp_ns: int = ros.STAMP_NS,
+    weights: tuple[float, float] = (0.0, 0.0),
+) -> object:
+    """cartographer_ros_msgs/LandmarkList of (id, position, quaternion), all of one weight."""
+    package = 'cartographer_ros_msgs/msg'
+    seen = [
+        ros.make(f'{package}/LandmarkEntry', name, ros.pose(position, quaternion), *weights)
+        for name, position, quaternion in entries
+    ]
+    return ros.make(f'{package}/LandmarkList', ros.header(frame_id, stamp_ns), seen)
+
+
+def range_bearing(
+    sensed: Iterable[tuple[int, float, float, float]],
+    frame_id: str,
+    stamp_ns: int = ros.STAMP_NS,
+    deviations: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> object:
+    """mrpt_msgs/ObservationRangeBearing of (id, range, yaw, pitch)."""
+    package = 'mrpt_msgs/msg'
+    seen = [
+        ros.make(f'{package}/SingleRangeBearingObservation', *where, number)
+        for number, *where in sensed
+    ]
+    header, pose = ros.header(frame_id, stamp_ns), ros.pose((0.0, 0.0, 0.0), NO_TURN)
+    whole = header, pose, 0.0, 100.0, *deviations, seen
+    return ros.make(f'{package}/ObservationRangeBearing', *whole)

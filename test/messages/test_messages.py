@@ -459,6 +459,8 @@ def example_messages() -> dict[str, bytes]:
         detector.aruco_markers(MARKERS, 'camera', package='aruco_interfaces'),
         detector.aruco_detection(MARKERS, 'camera', boards=['dock']),
         detector.isaac_apriltags(MARKERS, 'camera'),
+        detector.landmark_list([('dock', *MARKERS[0][1:])], 'camera', weights=(10.0, 5.0)),
+        detector.range_bearing([(7, 2.0, 0.1, 0.2)], 'mast', deviations=(0.1, 0.01, 0.01)),
         ros.make('geometry_msgs/msg/PoseStamped', header, pose),
         ros.make('geometry_msgs/msg/PoseWithCovarianceStamped', header, uncertain),
         transform,

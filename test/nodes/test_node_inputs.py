@@ -360,6 +360,8 @@ DETECTIONS = {
         detector.aruco_detection([MARKER], 'camera'),
         detector.aruco_markers([MARKER], 'camera'),
         detector.aruco_markers([MARKER], 'camera', package='aruco_interfaces'),
+        detector.landmark_list([('7', *MARKER[1:])], 'camera'),
+        detector.range_bearing([(7, 2.0, 0.1, 0.2)], 'camera'),
     )
 }
 
@@ -407,8 +409,8 @@ def test_what_else_a_topic_carries_is_answered_with_the_types_that_are_read():
     landmarks.check_publishers()
     assert landmarks.problem == (
         "'/landmarks' carries sensor_msgs/msg/LaserScan; PointCloud2, PointCloud, "
-        'AprilTagDetectionArray, PoseArray, Detection3DArray, ArucoDetection or ArucoMarkers '
-        'is needed'
+        'AprilTagDetectionArray, PoseArray, Detection3DArray, ArucoDetection, ArucoMarkers, '
+        'LandmarkList or ObservationRangeBearing is needed'
     )
 
 
