@@ -1,9 +1,11 @@
-"""Landmarks that a detector gives as poses: fiducials of ArUco packages and of Isaac ROS.
+"""Landmarks as packages give them: fiducials of ArUco and of Isaac ROS; Cartographer's, MRPT's.
 
 Messages are read from their bytes, so that none of the packages that define them is needed here.
 """
 
 from __future__ import annotations
+
+from hashlib import sha256
 
 import numpy as np
 
@@ -140,3 +142,163 @@ def _read_isaac_apriltag(reader: CdrReader) -> tuple[int, FloatArray]:
 def _usable(ids: IntArray) -> IntArray:
     """Return the unknown id in place of any that could not be published."""
     return np.where((ids >= 0) & (ids <= MAX_ID), ids, UNKNOWN_ID)
+
+
+FIRST_NAMED_ID = 2**31
+"""Names have the ids from here on, so that none is a number that people give landmarks."""
+
+MAX_NAMES = 10_000
+"""Most names in a run: more are ids that change from message to message, as of a tracker."""
+
+
+class LandmarkNames:
+    """Gives landmarks whose id is a text their number: the same in every run, as maps need it.
+
+    A text that is a number is that number, and any other one has 31 bits of its SHA-256. Whether
+    two have the same is known of those that came in this process.
+    """
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, int] = {}
+        self._names: dict[int, str] = {}
+
+    def number_of(self, name: str) -> int:
+        """Return the id of a landmark; MessageError if another one has it already."""
+        if name in ('', '-1'):
+            return UNKNOWN_ID
+        if name in self._numbers:
+            return self._numbers[name]
+        number = _as_number(name)
+        if number is None:
+            number = FIRST_NAMED_ID + _hash_of(name)
+        if number < FIRST_NAMED_ID:
+            return number
+        if number in self._names:
+            raise MessageError(
+                f"the landmarks '{self._names[number]}' and '{name}' both have the number "
+                f'{number}: rename one of them'
+            )
+        if len(self._numbers) == MAX_NAMES:
+            raise MessageError(
+                f"more than {MAX_NAMES} names of landmarks, the last one '{name}': each needs the "
+                'same id whenever it is seen'
+            )
+        self._numbers[name], self._names[number] = number, name
+        return number
+
+
+NAMES = LandmarkNames()
+"""The names of all landmarks that have been read in this process."""
+
+
+@reads(
+    'cartographer_ros_msgs/msg/LandmarkList',
+    role='landmarks',
+    package='drivers for Cartographer',
+    definition=(
+        'std_msgs/Header header\nLandmarkEntry[] landmarks\n'
+        f'{NESTED}cartographer_ros_msgs/LandmarkEntry\n'
+        'string id\ngeometry_msgs/Pose tracking_from_landmark_transform\n'
+        'float64 translation_weight\nfloat64 rotation_weight\n'
+    ),
+)
+def decode_landmark_list(reader: CdrReader) -> ObservationEvent:
+    """Read a cartographer_ros_msgs/LandmarkList, whose poses are in the frame of its header.
+
+    Cartographer's residuals are errors times their weight, so standard deviations are 1/weight.
+    With a translation's weight of zero that is unknown; with a rotation's the rotation is unused.
+    """
+    stamp_ns, frame_id = reader.header()
+    entries = [(reader.string(), reader.float64(_POSE + 2)) for _ in range(reader.uint32())]
+    ids = np.array([NAMES.number_of(name) for name, _ in entries], dtype=np.int64)
+    values = np.array([value for _, value in entries]).reshape(-1, _POSE + 2)
+    poses, weights = values[:, :_POSE], values[:, _POSE:]
+    variances = _variances(weights)
+    covariances = np.zeros((len(ids), 6, 6))
+    for axis in range(6):
+        covariances[:, axis, axis] = variances[:, axis // 3]
+    poses[variances[:, 1] == 0.0, 3:] = 0.0
+    return observed_poses(frame_id, stamp_ns, ids, poses, covariances)
+
+
+@reads(
+    'mrpt_msgs/msg/ObservationRangeBearing',
+    role='landmarks',
+    package='mrpt_slam',
+    definition=(
+        'std_msgs/Header header\ngeometry_msgs/Pose sensor_pose_on_robot\n'
+        'float64 min_sensor_distance\nfloat64 max_sensor_distance\n'
+        'float64 sensor_std_range\nfloat64 sensor_std_yaw\nfloat64 sensor_std_pitch\n'
+        'SingleRangeBearingObservation[] sensed_data\n'
+        f'{NESTED}mrpt_msgs/SingleRangeBearingObservation\n'
+        'float64 range\nfloat64 yaw\nfloat64 pitch\nint32 id\n'
+    ),
+)
+def decode_range_bearing(reader: CdrReader) -> ObservationEvent:
+    """Read an mrpt_msgs/ObservationRangeBearing, whose pitch is positive downwards, about y.
+
+    The sensor is where its frame is on /tf; ``sensor_pose_on_robot`` says the same without the
+    name of the base's frame, and is not used.
+    """
+    stamp_ns, frame_id = reader.header()
+    reader.float64(_POSE + 2)  # the sensor's pose, and its least and largest range
+    deviations = reader.float64(3)
+    sensed = [(reader.float64(3), reader.int32()) for _ in range(reader.uint32())]
+    numbers = np.array([number for _, number in sensed], dtype=np.int64)
+    measured = np.array([value for value, _ in sensed]).reshape(-1, 3)
+    usable = is_measured(measured) & (measured[:, 0] > 0.0)
+    ids: IntArray = np.where(numbers >= 0, numbers, UNKNOWN_ID)[usable]
+    points, axes = _along_and_across(measured[usable])
+    covariances = _polar_covariances(measured[usable, 0], axes, deviations)
+    return ObservationEvent(stamp_ns, ids, points, covariances, sensor_frame=frame_id)
+
+
+def _as_number(name: str) -> int | None:
+    """Return the id that a text is; None if it is a name, as with zeros before the number."""
+    if not (name.isascii() and name.isdigit()) or len(name) > len(str(MAX_ID)):
+        return None
+    number = int(name)
+    return number if str(number) == name and number <= MAX_ID else None
+
+
+def _hash_of(name: str) -> int:
+    digest = int.from_bytes(sha256(name.encode()).digest()[:8], 'big')
+    return digest % (MAX_ID + 1 - FIRST_NAMED_ID)
+
+
+def _variances(weights: FloatArray) -> FloatArray:
+    """Return 1/weight² (m, 2), zero where the weight says nothing."""
+    with np.errstate(divide='ignore', over='ignore', invalid='ignore'):
+        variances = weights**-2.0
+    result: FloatArray = np.where(np.isfinite(variances), variances, 0.0)
+    return result
+
+
+def _along_and_across(measured: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points (m, 3) of range, yaw and pitch, and axes (m, 3, 3): along, yaw, pitch."""
+    yaw, pitch = measured[:, 1], measured[:, 2]
+    zero = np.zeros_like(yaw)
+    level = np.stack([np.cos(yaw), np.sin(yaw), zero], axis=1)
+    left = np.stack([-np.sin(yaw), np.cos(yaw), zero], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    cosines, sines = np.cos(pitch)[:, None], np.sin(pitch)[:, None]
+    along = cosines * level - sines * up
+    down = -sines * level - cosines * up
+    return measured[:, :1] * along, np.stack([along, left, down], axis=2)
+
+
+def _polar_covariances(
+    ranges: FloatArray, axes: FloatArray, deviations: FloatArray
+) -> FloatArray | None:
+    """Return covariances (m, 3, 3) of range, yaw and pitch's deviations; None if unknown.
+
+    A pitch of none, as of a sensor in the plane, is taken to be as uncertain as the yaw.
+    """
+    of_range, of_yaw, of_pitch = deviations
+    if not (np.isfinite(deviations).all() and of_range > 0.0 and of_yaw > 0.0):
+        return None
+    across = ranges[:, None] * [of_yaw, of_pitch if of_pitch > 0.0 else of_yaw]
+    scaled = axes * np.insert(across, 0, of_range, axis=1)[:, None, :]
+    with np.errstate(over='ignore', invalid='ignore'):
+        covariances: FloatArray = scaled @ scaled.swapaxes(1, 2)
+    return covariances if np.isfinite(covariances).all() else None

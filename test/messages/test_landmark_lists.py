@@ -10,8 +10,8 @@ import ros_messages as ros
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.events import MAX_ID
-from slam_observer_ros.messages import landmark_lists
-from slam_observer_ros.messages.landmark_lists import FIRST_NAMED_ID, LandmarkNames
+from slam_observer_ros.messages import fiducials
+from slam_observer_ros.messages.fiducials import FIRST_NAMED_ID, LandmarkNames
 from slam_observer_ros.messages.registry import decoders
 
 TURN = np.array([0.0, 0.0, 0.6, 0.8])
@@ -42,7 +42,7 @@ def test_the_largest_number_is_an_id_and_a_larger_one_a_name():
 
 
 def test_names_that_share_a_number_are_refused_and_the_first_goes_on(monkeypatch):
-    monkeypatch.setattr(landmark_lists, '_hash_of', lambda name: 5)
+    monkeypatch.setattr(fiducials, '_hash_of', lambda name: 5)
     names = LandmarkNames()
     first = names.number_of('dock')
     expected = f"the landmarks 'dock' and 'door' both have the number {first}: rename one"
@@ -54,7 +54,7 @@ def test_names_that_share_a_number_are_refused_and_the_first_goes_on(monkeypatch
 
 
 def test_names_without_end_are_refused(monkeypatch):
-    monkeypatch.setattr(landmark_lists, 'MAX_NAMES', 2)
+    monkeypatch.setattr(fiducials, 'MAX_NAMES', 2)
     names = LandmarkNames()
     known = [names.number_of(name) for name in ('a', 'b')]
     with pytest.raises(MessageError, match="more than 2 names of landmarks, the last one 'c'"):
