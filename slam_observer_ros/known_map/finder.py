@@ -77,8 +77,7 @@ class Finder:
     ) -> None:
         self._maps = [_SearchedMap(known, state, rough) for known in maps]
         self._ids = np.concatenate([known.ids for known in maps])
-        for known in maps:
-            warn_of_symmetry(known, known.name if len(maps) > 1 else '')
+        self._has_warned = False  # of symmetries, which only points without ids suffer from
         self._searched: tuple[int, int] | None = None
         self.places: Places | None = None  # that fit, when it was searched last
 
@@ -108,6 +107,11 @@ class Finder:
         """Return the landmarks to go by, those seen last first; none if their ids are enough."""
         landmarks = state.landmarks
         has_no_id = is_automatic(landmarks.ids) & (landmarks.counts >= MIN_COUNT)
+        if has_no_id.any() and not self._has_warned:
+            self._has_warned = True
+            for known in self._maps:
+                name = known.loaded.name if len(self._maps) > 1 else ''
+                warn_of_symmetry(known.loaded, name)
         rows = np.flatnonzero(has_no_id | np.isin(landmarks.ids, self._ids))
         are_ids_enough = len(self._maps) == 1 and not has_no_id.any()
         if are_ids_enough or len(rows) <= state.axes.point:

@@ -56,8 +56,9 @@ class Looks:
 def symmetries(known: LandmarkMap) -> list[Symmetry]:
     """Return the turns about the vertical after which a map looks the same, the best first.
 
-    Any of these leaves the centre of the landmarks where it is, and takes the outermost one to one
-    as far from there.
+    Of turns that are as good the smallest is the first, as it makes the others. Any of these
+    leaves the centre of the landmarks where it is, and takes the outermost one to one as far from
+    there.
     """
     from scipy.spatial import cKDTree
 
@@ -82,7 +83,7 @@ def symmetries(known: LandmarkMap) -> list[Symmetry]:
         is_new = all(_turn_rad(symmetry.transform, other) > LEAST_TURN_RAD for other in others)
         if is_new and symmetry.is_same.mean() >= SAME_SHARE:
             found.append(symmetry)
-    return sorted(found, key=lambda symmetry: -int(symmetry.is_same.sum()))
+    return sorted(found, key=lambda each: (-int(each.is_same.sum()), round(each.turn_deg)))
 
 
 def _turn_rad(T: FloatArray, other: FloatArray) -> float:

@@ -55,6 +55,20 @@ class TestWithoutIds:
                 estimator.add(without_ids(event))
         assert 'Found the pose in the map by 8 of 8 landmarks (wrong with a prob' in caplog.text
 
+    @pytest.mark.parametrize('are_known', [True, False])
+    def test_a_map_that_is_the_same_turned_matters_only_to_points_without_ids(
+        self, are_known, caplog
+    ):
+        world = World(0, is_planar=True)
+        angles = np.arange(50) * np.pi / 25
+        world.points = 8.0 * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
+        estimator = Estimator(world.settings(localization_mode='uncertain'))
+        estimator.load_map(world.map())
+        views = [world.see(0.1 * i, world.near(0.0, 1 if i < 9 else 8)) for i in range(20)]
+        add(estimator, views if are_known else map(without_ids, views))
+        assert estimator.is_localised == are_known
+        assert caplog.text.count('is the same turned by 7°') == (not are_known)
+
     def test_two_places_that_fit_are_named_and_a_rough_pose_decides(self, caplog):
         world = World(0, is_planar=True)
         world.points[25:] = -world.points[:25]

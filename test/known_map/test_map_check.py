@@ -56,7 +56,14 @@ def test_random_halls_do_not_look_the_same(seed):
 
 def test_a_square_of_four_looks_the_same_three_times():
     square = np.array([[0.0, 0, 0], [8, 0, 0], [8, 8, 0], [0, 8, 0]])
-    assert sorted(round(s.turn_deg) for s in symmetries(hall(square))) == [90, 90, 180]
+    assert [round(s.turn_deg) for s in symmetries(hall(square))] == [90, 90, 180]
+
+
+@pytest.mark.parametrize('count', [5, 8, 12, 24])
+def test_of_a_ring_the_smallest_turn_is_named(count):
+    angles = 2.0 * np.pi * np.random.default_rng(0).permutation(count) / count
+    ring = 5.0 * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
+    assert symmetries(hall(ring))[0].turn_deg == pytest.approx(360 / count, abs=0.1)
 
 
 def test_one_look_finds_a_robot_in_a_random_hall_and_never_in_one_that_looks_the_same():
