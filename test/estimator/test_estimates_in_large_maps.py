@@ -11,6 +11,7 @@ import pytest
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
@@ -100,3 +101,26 @@ def test_landmarks_make_room_for_others():
     estimator = estimate(drive(settings, 40.0, landmarks=40), settings)
     assert estimator.counts['forgotten_landmark'] > 0
     assert np.linalg.eigvalsh(estimator.landmark_covariances).min() > 0.0
+
+
+def test_more_new_tags_at_once_than_are_active_keep_their_orientations(monkeypatch):
+    """The orientation of a landmark that is no longer active enters P, not another's columns."""
+    rng, tags = np.random.default_rng(3), 30
+    points = rng.uniform(-5.0, 5.0, (tags, 3))
+    orientations = so3.exp(rng.normal(size=(tags, 3)))
+
+    def seen():
+        estimator = Estimator(replace(SETTINGS, use_tag_orientation=True))
+        for k in range(4):
+            estimator.add(
+                ObservationEvent(k * 10**8, np.arange(tags), points, orientations=orientations)
+            )
+            estimator.add(VelocityEvent(k * 10**8, np.array([0.0, 0.0, 0.1, 0.3, 0.0, 0.0])))
+        rows = np.arange(tags)
+        return estimator._state.errors.orientation_sigmas(rows), estimator.landmark_covariances
+
+    sigmas, covariances = seen()
+    monkeypatch.setattr(RiccatiGains, 'block', BlockSize(dense=10**9))
+    expected_sigmas, expected_covariances = seen()
+    np.testing.assert_allclose(sigmas, expected_sigmas, rtol=1e-6)
+    np.testing.assert_allclose(covariances, expected_covariances, rtol=1e-6, atol=1e-9)

@@ -153,6 +153,14 @@ class ActiveLandmarks(JointCovariance):
             part = slice(start, start + self._size.most)
             super().add_seen(covariances[part], None if D is None else D[part])
 
+    def add_turns(
+        self, rows: IntArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
+        """Take over orientations (m,) seen for the first time: ω_i = φ_i + noise (m, q, q)."""
+        if (self._places[rows] < 0).any():  # more were added at once than are active
+            self._switch(self._chosen(rows))
+        super().add_turns(rows, covariances, D)
+
     def _make_room(self, m: int) -> IntArray:
         """Append rows and columns for m landmarks; return which landmarks they are."""
         super()._make_room(m)
