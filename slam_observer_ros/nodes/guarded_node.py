@@ -42,10 +42,12 @@ class ThrottledLog:
         if self._is_due(subject):
             self._node.get_logger().error(text)
 
-    def warning(self, subject: str, text: str) -> None:
-        """Log a warning, unless there was one about the subject lately."""
-        if self._is_due(subject):
+    def warning(self, subject: str, text: str) -> bool:
+        """Log a warning, unless there was one about the subject lately; return whether it is."""
+        is_due = self._is_due(subject)
+        if is_due:
             self._node.get_logger().warning(text)
+        return is_due
 
     def info(self, subject: str, text: str) -> None:
         """Log information, unless there was some about the subject lately."""

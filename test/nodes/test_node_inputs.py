@@ -559,7 +559,8 @@ def test_optional_packages_are_named_when_they_are_missing(tmp_path, monkeypatch
         assert 'Traceback' not in node.output
 
 
-def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatch):
+def test_a_driver_that_falls_silent_is_logged_once_each_time(monkeypatch):
+    """A robot may be parked for days."""
     clock = SimpleNamespace(now_s=1000.0)
     monkeypatch.setattr(time, 'monotonic', lambda: clock.now_s)
     node, qos = Mock(), QoSProfile(depth=1)
@@ -580,12 +581,18 @@ def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatc
     for _ in range(20):
         receive(b'', {'received_timestamp': 0})
         assert not check_for(1)
-    logged = check_for(20)
-    assert logged[0] == "no message on '/twist' for 6 s, though it has a publisher"
-    assert len(logged) == 2, 'not throttled'
+    logged = check_for(100)
+    assert logged == ["no message on '/twist' for 6 s, though it has a publisher"]
+    assert 'for 101 s' in source.problem
     receive(b'', {'received_timestamp': 0})
-    assert len(check_for(4)) == 2
+    assert len(check_for(4)) == 1
     assert not source.problem
+    assert check_for(100) == 2 * logged
+    receive(b'', {'received_timestamp': 0})
+    assert len(check_for(7)) == 3
+    receive(b'', {'received_timestamp': 0})
+    assert len(check_for(7)) == 3, 'one line in 10 s'
+    assert len(check_for(20)) == 4, 'but not forgotten'
 
 
 def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):

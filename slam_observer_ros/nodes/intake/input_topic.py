@@ -192,6 +192,7 @@ class InputTopic(Generic[MessageT]):
         self.shedding = LoadShedding(max_wait_s)
         self._is_shedding = max_wait_s < math.inf
         self.last_received_s: float | None = None
+        self._said_silent = 0, False  # messages so far, and /clock's standing, as it was logged
         self._checked_s = -WELL_S
         self._looked_s = self._resumed_s = time.monotonic()
         self._held_s = 0.0  # how long the node itself was busy before it resumed
@@ -224,11 +225,10 @@ class InputTopic(Generic[MessageT]):
             return f"no message yet on '{self.topic}' ({wanted})"
         now_s = time.monotonic()
         if (silent_s := self.silent_s) > DISCOVERY_S:
-            stopped_s = now_s - self._clock_since_s
-            if self._node.get_clock().ros_time_is_active and stopped_s > DISCOVERY_S:
+            if self._clock_stands:
                 return (
-                    f'/clock stands still for {stopped_s:.0f} s, and nothing comes on '
-                    f"'{self.topic}': go on with the simulation or the recording"
+                    f'/clock stands still for {now_s - self._clock_since_s:.0f} s, and nothing '
+                    f"comes on '{self.topic}': go on with the simulation or the recording"
                 )
             return f"no message on '{self.topic}' for {silent_s:.0f} s, though it has a publisher"
         if self._held_s and now_s - self._resumed_s < DISCOVERY_S:
@@ -247,7 +247,8 @@ class InputTopic(Generic[MessageT]):
     def check_publishers(self) -> None:
         """See what the topic carries; subscribe to it, or report why nothing comes.
 
-        While messages come and all was well, that is asked once a second: it takes a while.
+        While messages come and all was well, that is asked once a second: it takes a while. That
+        a topic has fallen silent is logged once, until it is heard again.
         """
         age_s, now_s = self.age_s, time.monotonic()
         self._note_look(now_s)
@@ -260,8 +261,20 @@ class InputTopic(Generic[MessageT]):
         usable = [name for name in self._decoders if name in types]
         missing = self._listen_for_one_of(usable, now_s)
         self._fault = missing or self._find_fault(publishers, usable)
-        if problem := self.problem or (self.doubt and self.doubt.text()):
-            self._log.warning(self.topic, problem)
+        # A robot that is parked may be silent for days.
+        is_silent = bool(self.received and not self._fault and self.silent_s > DISCOVERY_S)
+        silence = self.received, self._clock_stands
+        if is_silent and silence == self._said_silent:
+            return
+        problem = self.problem or (self.doubt and self.doubt.text())
+        if problem and self._log.warning(self.topic, problem) and is_silent:
+            self._said_silent = silence
+
+    @property
+    def _clock_stands(self) -> bool:
+        """Whether /clock, by which the node goes, has stood still for some time."""
+        stopped_s = time.monotonic() - self._clock_since_s
+        return bool(self._node.get_clock().ros_time_is_active and stopped_s > DISCOVERY_S)
 
     def begin_looking(self) -> None:
         """Note that topics were not to be looked at up to now."""
