@@ -34,6 +34,17 @@ NEAR_NS = 1_000_000_000
 """Stamps nearer than this to the newest one are of no pause or jump, nanoseconds."""
 
 
+YEAR_NS = 365 * 24 * 3600 * NANOSECONDS_PER_SECOND
+
+
+def is_of_1970(stamp_ns: int) -> bool:
+    """Return whether a stamp is of 1970, as one that counts from the start of something is.
+
+    So do the clocks of a simulation, of a microcontroller and of a machine since it was booted.
+    """
+    return stamp_ns < YEAR_NS
+
+
 def is_due(stamp_ns: int, last_ns: int | None, period_ns: int) -> bool:
     """Return whether what was done at a stamp is to be done again, a period later.
 

@@ -21,7 +21,7 @@ from slam_observer_ros.common.errors import (
     YamlError,
 )
 from slam_observer_ros.common.files import load_yaml, plain_value, unfinished_file
-from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.common.stamps import is_of_1970, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import GIVEN_POSE_STD
@@ -81,11 +81,11 @@ class InitialPoseListener:
         """Move the robot to where it was at a stamp, and add how it moved since, as AMCL does."""
         estimator = self._estimator
         now_ns = estimator.stamp_ns or 0
-        ahead_ns = stamp_ns - int(self._node.get_clock().now().nanoseconds)
-        if ahead_ns > FUTURE_NS:
+        if other_clock := self._other_clock(stamp_ns):
+            stamp_ns = 0
             self._node.get_logger().warning(
-                f"the pose given is stamped {to_s(ahead_ns):.3f} s ahead of this machine's clock: "
-                'it is taken as of now; synchronise the clocks'
+                f'the pose given is stamped {other_clock[0]}: it is taken as of now; '
+                f'{other_clock[1]}'
             )
         if not 0 < stamp_ns < now_ns or estimator.knows_motion_since(stamp_ns):
             estimator.set_pose(pose, covariance, min(stamp_ns or now_ns, now_ns))
@@ -100,7 +100,34 @@ class InitialPoseListener:
         moved = of_moved_pose(covariance, pose, motion, np.zeros((6, 6)))
         estimator.set_pose(pose @ motion, moved)
 
+    def _other_clock(self, stamp_ns: int) -> tuple[str, str] | None:
+        """Return by which other clock a pose is stamped, and what to do; None if by none."""
+        clock = self._node.get_clock()
+        ahead_ns = stamp_ns - int(clock.now().nanoseconds)
+        if ahead_ns > FUTURE_NS:
+            is_of_system = abs(stamp_ns - time.time_ns()) < ahead_ns
+            if clock.ros_time_is_active and is_of_system:
+                return (
+                    "by the system's clock, and this node follows /clock",
+                    'set use_sim_time in RViz, or in what else gives it',
+                )
+            return (
+                f"{to_s(ahead_ns):.3f} s ahead of this machine's clock",
+                'synchronise the clocks',
+            )
+        if stamp_ns and is_of_1970(stamp_ns) and not is_of_1970(self._estimator.stamp_ns or 0):
+            return (
+                "in 1970, as by a simulation's clock",
+                'let this node, RViz and what else gives it agree in use_sim_time',
+            )
+        return None
+
     def _check(self, message: PoseMessage) -> None:
+        if not message.frame_id:
+            self._node.get_logger().warning(
+                f"the pose given names no frame: it is taken as one in '{self._map_frame}'; let "
+                'what gives it fill in header.frame_id'
+            )
         if message.frame_id.lstrip('/') not in ('', self._map_frame):
             raise MessageError(f"it is in frame '{message.frame_id}', not '{self._map_frame}'")
         if not np.isfinite(message.position).all():

@@ -300,6 +300,31 @@ def test_another_clock_is_found_and_corrected_once():
     assert clock.correction_ns == 0
 
 
+@pytest.mark.parametrize('since_s', [0.0, 300.0, 100 * 86400.0])
+def test_stamps_of_1970_are_named_as_such(since_s):
+    """Of a driver that counts from its start, or of a simulation: neither is slow."""
+    clock, now_ns = ClockOffset(SECOND), 1_800_000_000 * SECOND
+    for index in range(SAMPLES):
+        clock.add(round(since_s * SECOND) + index * SECOND, now_ns + index * SECOND)
+    for is_simulated in (False, True):
+        text = clock.problem("'/odom'", is_simulated)
+        assert text.startswith("stamps on '/odom' are of 1970: ")
+        assert 'correct_clock_offset' in text
+        assert 'faster' not in text
+        assert ('set use_sim_time' in text) != is_simulated
+    assert clock.correction_ns == now_ns - round(since_s * SECOND)
+
+
+def test_stamps_of_1970_are_right_where_the_clock_is_a_simulations():
+    clock = ClockOffset(SECOND)
+    for index in range(SAMPLES):
+        clock.add(index * SECOND, index * SECOND + 1, is_simulated=True)
+    assert not clock.problem("'/odom'", is_simulated=True)
+    for index in range(SAMPLES):
+        clock.add(index * SECOND, (index + 5) * SECOND, is_simulated=True)
+    assert '1970' not in clock.problem("'/odom'", is_simulated=True)
+
+
 def test_when_this_machines_clock_has_jumped_the_offset_is_found_again():
     clock = ClockOffset(SECOND)
     for index in range(SAMPLES):

@@ -342,11 +342,39 @@ def test_an_initial_pose_beyond_what_the_parameter_allows_is_refused(x):
 
 
 @pytest.mark.parametrize('frame_id', ['/map', ''])
-def test_an_initial_pose_may_have_a_frame_with_a_slash_or_none(frame_id):
+def test_an_initial_pose_may_have_a_frame_with_a_slash_or_none_which_is_said(frame_id):
     given = GivenPose()
     given.give(se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0])), frame_id=frame_id)
     assert_allclose(given.estimator.pose[0, 3], 3.0)
     given.on_move.assert_called_once_with()
+    said = [call.args[0] for call in given.node.get_logger().warning.call_args_list]
+    assert len(said) == (not frame_id)
+    assert all("names no frame: it is taken as one in 'map'" in text for text in said)
+
+
+@pytest.mark.parametrize(('is_simulated', 'now_s', 'newest_s', 'stamp_s', 'said'), [
+    (True, 100.0, 100.0, None, 'set use_sim_time in RViz'),  # a simulation, RViz on wall time
+    (True, None, None, None, ''),  # /clock of a simulator that has the system's time
+    (False, None, None, 100.0, 'agree in use_sim_time'),  # the other way round
+    (False, None, 100.0, 101.0, ''),  # drivers have the simulation's time, too
+    (True, 100.0, 100.0, 109.0, 'synchronise the clocks'),
+])  # fmt: skip
+def test_an_initial_pose_by_the_wrong_one_of_two_clocks_is_named(
+    is_simulated, now_s, newest_s, stamp_s, said
+):
+    given = GivenPose()
+    ns = [time.time_ns() if s is None else round(s * 1e9) for s in (now_s, newest_s, stamp_s)]
+    given.stamp_ns = ns[1]
+    given.drive(1, CIRCLE)
+    given.node.get_clock().now().nanoseconds = ns[0] + 2_000_000_000
+    given.node.get_clock().ros_time_is_active = is_simulated
+    pose = se3.from_rpy((1.0, -2.0, 0.0, 0.0, 0.0, 1.0))
+    given.give(pose, stamp_ns=ns[2])
+    texts = [call.args[0] for call in given.node.get_logger().warning.call_args_list]
+    assert len(texts) == bool(said)
+    assert all(said in text and 'it is taken as of now' in text for text in texts)
+    if said:
+        assert_allclose(given.estimator.pose, pose, atol=1e-6)
 
 
 CIRCLE = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])

@@ -9,7 +9,7 @@ from statistics import median_low
 import time
 from typing import Any, TypeAlias
 
-from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.common.stamps import is_of_1970, to_s
 
 SAMPLES = 11
 """Messages whose median offset is looked at: five stragglers in a row change nothing."""
@@ -40,6 +40,7 @@ class ClockOffset:
         self._recent: deque[int] = deque(maxlen=SAMPLES)
         self.offset_ns: int | None = None
         self.correction_ns = 0
+        self._counts_from_start = False
 
     @property
     def is_off(self) -> bool:
@@ -57,6 +58,12 @@ class ClockOffset:
 
         ``is_simulated``: this machine's clock is /clock.
         """
+        if self.is_off and self._counts_from_start:
+            return (
+                f'stamps on {topic} are of 1970: they count from the start of a driver or machine '
+                '(let it stamp with the time of ROS, or set correct_clock_offset), or are of a '
+                f'simulation ({"whose /clock is another" if is_simulated else "set use_sim_time"})'
+            )
         advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
         if is_simulated:
             advice = 'see whether their publisher uses /clock, and this machine keeps up with it'
@@ -77,6 +84,7 @@ class ClockOffset:
         # /clock stands still between two of its messages.
         self._ahead_ns = self._limit_ns if is_simulated else min(FUTURE_NS, self._limit_ns)
         self._recent.append(stamp_ns - receive_ns)
+        self._counts_from_start = is_of_1970(stamp_ns) and not is_of_1970(receive_ns)
         if len(self._recent) < SAMPLES:
             return
         self.offset_ns = median_low(self._recent)
