@@ -49,15 +49,16 @@ def without_ids(world: World) -> World:
     return replace(world, events=[_anonymous(event) for event in world.events])
 
 
-def with_false_points(world: World, seed: int) -> World:
-    """Take the ids away and add 5 % of points where nothing is, as reflections make them.
+def with_false_points(world: World, seed: int, share: float | None = None) -> World:
+    """Take the ids away and add points where nothing is, as reflections make them.
 
-    They are seen where some landmark was at another time of the run, so the sensor can see there.
+    By default 5 % more. They are seen where some landmark was at another time of the run, so the
+    sensor can see there.
     """
-    rng = np.random.default_rng(seed)
+    rng, share = np.random.default_rng(seed), FALSE_SHARE if share is None else share
     anonymous = without_ids(world)
     elsewhere = [event for event in anonymous.events if isinstance(event, ObservationEvent)]
-    events = [_joined(event, elsewhere, rng) for event in anonymous.events]
+    events = [_joined(event, elsewhere, share, rng) for event in anonymous.events]
     return replace(anonymous, events=events)
 
 
@@ -88,12 +89,14 @@ def _untouched(event: Event, other: Event) -> Event:
     return event.select((event.ids == other.ids) & (event.points == other.points).all(axis=1))
 
 
-def _joined(event: Event, elsewhere: list[ObservationEvent], rng: np.random.Generator) -> Event:
+def _joined(
+    event: Event, elsewhere: list[ObservationEvent], share: float, rng: np.random.Generator
+) -> Event:
     """Return an observation with single points of others in it, now and then."""
     if not isinstance(event, ObservationEvent):
         return event
     parts = [event]
-    for _ in range(rng.binomial(len(event.ids), FALSE_SHARE)):
+    for _ in range(rng.binomial(len(event.ids), share)):
         other = elsewhere[rng.integers(len(elsewhere))]
         parts.append(other.select(np.arange(len(other.ids)) == rng.integers(len(other.ids))))
     covariances = [part.covariances for part in parts if part.covariances is not None]

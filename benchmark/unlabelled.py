@@ -1,34 +1,58 @@
 """What it costs to map without ids: configuration error, consistency and CPU time over those with.
 
 ``python benchmark/unlabelled.py`` prints a row a run, and the means over runs of one kind: of
-landmarks with ids, without, and without but with 5 % false points.
+landmarks with ids, without, and without but with 5 % false points. ``--random N`` draws a hall a
+seed instead (:mod:`halls`), and prints how the ratios are distributed: work on ``--half work``
+of the seeds, and report the other half.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import logging
+import math
+import os
 import sys
 import time
 
+import halls
 import numpy as np
 import outliers
 from threadpoolctl import threadpool_limits
 import worlds
 from worlds import World
 
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.runs.health import of_estimate, of_rejections
 
 NEES_EVERY = 10
 """Observations from one covariance of the configuration to the next: these cost O(n³)."""
 
 MRCLAM_S = 600.0
 """How much of each MRCLAM run is taken by default, seconds."""
+
+
+HALVES = {'work': (0,), 'report': (1,), 'both': (0, 1)}
+"""Remainders, by two, of the seeds of a half."""
+
+WELL_SEEN = 10
+"""Sightings with ids from which on a landmark is too few where the map without has it not."""
+
+WRONG_ANEES, WRONG_COUNT = 3.0, 2
+"""From where on a map is wrong: so many times the ANEES with ids (or 1, if that is less), or so
+many landmarks too many.
+"""
+
+SAYS_SO = ('unexpected_place', 'doubled_landmark')
+"""Findings that say that a map without ids may be wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +63,42 @@ class Outcome:
     anees: float
     cpu_s: float
     landmarks: int
+    stands_for: tuple[int, ...]  # the true landmark that each of them is
+    well_seen: frozenset[int]  # true landmarks seen often
+    findings: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """A hall without ids, over the same with ids."""
+
+    hall: halls.Hall
+    ratio: float  # of the configuration error
+    anees: float
+    anees_with_ids: float
+    too_many: int  # landmarks that stand for one that another stands for, too, or for none
+    too_few: int  # well seen ones that none stands for
+    cpu: float
+    findings: frozenset[str]
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the map or what is stated of it is wrong, and not so with ids, too."""
+        limit = WRONG_ANEES * max(self.anees_with_ids, 1.0)
+        return not self.anees <= limit or self.too_many >= WRONG_COUNT
+
+    @property
+    def says_so(self) -> bool:
+        """Whether a finding says that the map may be wrong."""
+        return not self.findings.isdisjoint(SAYS_SO)
+
+    def __str__(self) -> str:
+        return (
+            f'{self.ratio:5.2f} ×  ANEES {self.anees:6.2f} ({self.anees_with_ids:.2f} with ids)  '
+            f'+{self.too_many} −{self.too_few}  {self.cpu:4.1f} × CPU  '
+            f'{"WRONG" if self.is_wrong else "right"}  {self.hall}; '
+            f'{", ".join(sorted(self.findings)) or "no finding"}'
+        )
 
 
 def main() -> None:
@@ -47,9 +107,14 @@ def main() -> None:
     parser.add_argument('--only', default='', metavar='NAME', help='runs whose name has NAME')
     parser.add_argument('--seeds', type=int, default=5, help='loops, and draws of false points')
     parser.add_argument('--mrclam-s', type=float, default=MRCLAM_S, help='of each MRCLAM run')
+    parser.add_argument('--random', type=int, metavar='N', help='random halls, of seeds up to N')
+    parser.add_argument('--half', choices=HALVES, default='work', help='of these seeds')
+    parser.add_argument('--jobs', type=int, default=os.cpu_count(), help='processes')
     args = parser.parse_args()
-    threadpool_limits(1)
-    logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
+    if args.random:
+        compare_random([i for i in range(args.random) if i % 2 in HALVES[args.half]], args.jobs)
+        return
+    _prepare()
     sys.stdout.write(
         '| run | landmarks | error with ids, m | without | + false | ANEES with ids '
         '| without | + false | CPU with ids, s | without | + false |\n' + '| --- ' * 11 + '|\n'
@@ -66,6 +131,63 @@ def main() -> None:
             f'{means[1]:.2f} ×; ANEES {means[2]:.2f}, {means[3]:.2f}; CPU {means[4]:.1f} ×, '
             f'{means[5]:.1f} ×\n'
         )
+
+
+def _prepare() -> None:
+    threadpool_limits(1)
+    logging.getLogger('slam_observer_ros').setLevel(logging.CRITICAL)
+
+
+def compare_random(seeds: Sequence[int], jobs: int) -> None:
+    """Compare a hall a seed, print each, and how they are distributed."""
+    rows: list[Compared] = []
+    with ProcessPoolExecutor(jobs, initializer=_prepare) as pool:
+        for row in pool.map(compared, seeds):
+            sys.stdout.write(f'{row}\n')
+            sys.stdout.flush()
+            rows.append(row)
+    sys.stdout.write(
+        '\n| halls | number | median | 90 % | worst | above 1.5 | too many | too few | ANEES > 3 '
+        '| wrong | of these unsaid | said of right ones | CPU |\n' + '| --- ' * 13 + '|\n'
+    )
+    for kind in sorted({row.hall.kind for row in rows}):
+        _print_kind(kind, [row for row in rows if row.hall.kind == kind])
+    _print_kind('all', rows)
+    kinds = sorted({kind for row in rows for kind in row.findings})
+    for kind in kinds:
+        named = [row.is_wrong for row in rows if kind in row.findings]
+        sys.stdout.write(f'{kind}: in {sum(named)} wrong ones and {named.count(False)} right\n')
+
+
+def _print_kind(kind: str, rows: Sequence[Compared]) -> None:
+    ratios = np.array([row.ratio for row in rows])
+    wrong, right = [r for r in rows if r.is_wrong], [r for r in rows if not r.is_wrong]
+    sys.stdout.write(
+        f'| {kind} | {len(rows)} | {np.median(ratios):.2f} | {np.percentile(ratios, 90):.2f} | '
+        f'{ratios.max():.2f} | {np.mean(ratios > 1.5):.0%} | {sum(r.too_many for r in rows)} | '
+        f'{sum(r.too_few for r in rows)} | {sum(not r.anees <= WRONG_ANEES for r in rows)} | '
+        f'{len(wrong)} | {sum(not r.says_so for r in wrong)} | '
+        f'{sum(r.says_so for r in right)} of {len(right)} | '
+        f'{np.mean([r.cpu for r in rows]):.1f} × |\n'
+    )
+
+
+def compared(seed: int) -> Compared:
+    """Run the hall of a seed with ids and without."""
+    hall = halls.draw(seed)
+    measured = halls.world(hall)
+    with_ids, without = run(measured), run(halls.without_ids(hall, measured))
+    true = set(without.stands_for) & set(measured.landmarks.ids.tolist())
+    return Compared(
+        hall,
+        without.rmse_m / with_ids.rmse_m,
+        without.anees,
+        with_ids.anees,
+        len(without.stands_for) - len(true),
+        len(with_ids.well_seen - true),
+        without.cpu_s / with_ids.cpu_s,
+        without.findings,
+    )
 
 
 def runs(seeds: int, mrclam_s: float) -> Iterator[tuple[str, str, World, range]]:
@@ -129,12 +251,24 @@ def run(world: World) -> Outcome:
                 update.ids[~update.rejected],
             )
         start_s = time.process_time()
+    ids = estimator.landmark_ids
+    true_ids = error.true_ids(ids)
     return Outcome(
-        error.rmse_m or float('nan'),
-        error.anees or float('nan'),
+        error.rmse_m or math.inf,
+        error.anees or math.inf,
         cpu_s,
-        len(estimator.landmark_ids),
+        len(ids),
+        tuple(true_ids.tolist()),
+        frozenset(true_ids[estimator.landmark_counts >= WELL_SEEN].tolist()),
+        frozenset(finding.kind for finding in _findings(estimator)),
     )
+
+
+def _findings(estimator: Estimator) -> Iterator[Finding]:
+    """Yield what node and replay say of an estimate."""
+    yield from of_estimate(estimator)
+    yield from of_rejections(estimator.counts)
+    yield from (found(kind) for kind in UNEXPECTED_POSES if estimator.counts[kind])
 
 
 if __name__ == '__main__':

@@ -116,6 +116,10 @@ class Loop:
         slow robots. Each is beside the course when the robot first comes by.
     max_seen : int
         How many of the nearest it looks at.
+    detected_share : float
+        Share of the landmarks in view that it sees.
+    view_rad : float
+        Angle that it sees, half of it to either side of straight ahead.
 
     """
 
@@ -127,6 +131,8 @@ class Loop:
     observation_rate_hz: int
     moving_share: float = 0.0
     max_seen: int = 5
+    detected_share: float = DETECTED_SHARE
+    view_rad: float = 2.0 * math.pi
 
 
 STEREO_LOOP = Loop('stereo_inertial', 300.0, 390.0, 100, 6.0, 5)
@@ -375,7 +381,10 @@ def _look(
     points = se3.transform(se3.inverse(pose), landmarks.world_points)
     range_m = np.linalg.norm(points, axis=1)
     nearest = np.argsort(range_m)[: loop.max_seen]
-    seen = (range_m[nearest] <= loop.max_range_m) & (rng.random(len(nearest)) < DETECTED_SHARE)
+    seen = range_m[nearest] <= loop.max_range_m
+    seen &= rng.random(len(nearest)) < loop.detected_share
+    bearings_rad = np.arctan2(points[nearest, 1], points[nearest, 0])
+    seen &= np.abs(bearings_rad) <= 0.5 * loop.view_rad
     rows = np.sort(nearest[seen])
     return ObservationEvent(stamp_ns, landmarks.ids[rows], points[rows])
 

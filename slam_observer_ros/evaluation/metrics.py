@@ -239,8 +239,7 @@ class ConfigurationError:
         if np.count_nonzero(without_id):
             without_id &= np.isin(ids, ids if seen_ids is None else seen_ids)
             self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
-        true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
-        rows, true_rows = np.nonzero(true_ids[:, None] == truth.ids)
+        rows, true_rows = np.nonzero(self.true_ids(ids)[:, None] == truth.ids)
         if not len(rows):
             return
 
@@ -261,6 +260,10 @@ class ConfigurationError:
         for landmark_id, point in zip(ids.tolist(), seen, strict=True):
             nearest = np.argmin(np.linalg.norm(true_seen - point, axis=1))
             self._votes[landmark_id][int(true_ids[nearest])] += 1
+
+    def true_ids(self, ids: IntArray) -> IntArray:
+        """Return the true landmark (n,) that each stands for; its own id where it had one."""
+        return np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
 
     def _true_id(self, landmark_id: int) -> int:
         votes = self._votes.get(landmark_id)
