@@ -65,7 +65,7 @@ examples:
       a public data set as a recording
   slam-observer map convert tags.csv tags.yaml
       a table of surveyed landmarks as a map file
-  slam-observer replay robot1.mcap --plot figures --tum robot1.tum
+  slam-observer replay robot1.mcap --report robot1.html --tum robot1.tum
       a recording through the observer, and its accuracy
   slam-observer replay my_robot.mcap --config my_robot.yaml --json
       your own recording, with the parameter file of your observer_node

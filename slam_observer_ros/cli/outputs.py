@@ -115,11 +115,10 @@ def check_directory(directory: Path) -> None:
 
 
 @contextmanager
-def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
+def filled_directory(directory: Path) -> Iterator[Path]:
     """Give a directory to write in, whose files go to ``directory`` when all are written.
 
-    Files of these ``names`` that were not written are removed from there. Raises an
-    OutputError if that fails.
+    Raises an OutputError if that fails.
     """
     beside = directory if directory.is_dir() else directory.parent
     try:
@@ -129,11 +128,8 @@ def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
             except EvaluationError as error:  # which names a directory that is gone then
                 raise OutputError(str(error).replace(str(unfinished), str(directory))) from error
             directory.mkdir(exist_ok=True)
-            files = sorted(unfinished.iterdir())
-            for file in files:
+            for file in sorted(unfinished.iterdir()):
                 file.replace(destination(directory / file.name))
-            for name in set(names) - {file.name for file in files}:
-                (directory / name).unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or error  # its whole text names a directory that is gone by now
         raise OutputError(f"can't write figures to {directory}: {reason}") from error

@@ -164,6 +164,7 @@ def outcome_of(
             truth=truth,
             errors=accuracy.pose_errors,
             anees=accuracy.anees,
+            configuration=result.configuration,
             instants=recorder.finish(estimator),
             innovations=recorder.innovations,
         )
@@ -262,9 +263,19 @@ def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
         outcome.result.dead_reckoning,
         outcome.result.estimator,
     )
+    accuracy = measure_smoothed(smoothed, trajectory, online, outcome.truth)
+    whole_run = outcome.whole_run
+    if whole_run is not None:
+        whole_run = replace(
+            whole_run,
+            smoothed=trajectory,
+            smoothed_points=smoothed.world_points,
+            smoothed_errors=accuracy.pose_errors,
+        )
     return replace(
         outcome,
         smoothed=smoothed,
         smoothed_trajectory=trajectory,
-        smoothed_accuracy=measure_smoothed(smoothed, trajectory, online, outcome.truth),
+        smoothed_accuracy=accuracy,
+        whole_run=whole_run,
     )

@@ -41,7 +41,7 @@ INSTEAD = {
 class Records:
     """What of a run is kept beside its figures.
 
-    That are all poses, NIS, all that a page or a figure shows, and the map; and the estimate as a
+    That are all poses, NIS, all that a page shows, and the map; and the estimate as a
     recording, with its inputs or without, which replaces none unless ``overwrite``.
     """
 

@@ -20,7 +20,6 @@ from slam_observer_ros.cli.outputs import (
     add_result_options,
     check_outputs,
     check_plots,
-    figure_files,
     filled_directory,
     recording_path,
 )
@@ -199,7 +198,7 @@ def run(args: argparse.Namespace) -> None:
     if args.output is not None:
         _record(simulation, args.output, args.force)
     if args.plot is not None:
-        with filled_directory(args.plot, figure_files(args, FIGURES)) as unfinished:
+        with filled_directory(args.plot) as unfinished:
             _draw(simulation, result, unfinished, args.plot_format)
     if args.json:
         print_json(_as_json(args, result))

@@ -6,17 +6,15 @@ Ellipses of 95 % show such covariances in a plane of the map.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
+from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.matrices import transpose
 
 MAX_SHARE_OF_ANCHOR = 0.1
 """ANEES that the anchor's own error may make up at most; 1 is what all errors together have."""
@@ -99,44 +97,6 @@ def anchored_average_nees(
     return average_nees(pose_errors(paired.poses, anchored.poses), covariances[covered])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NeesOverTime:
-    """NEES per degree of freedom (k,) at ``stamps_ns`` (k,), where anything is uncertain.
-
-    Of honest covariances 95 % lie within ``band``.
-    """
-
-    stamps_ns: IntArray
-    values: FloatArray
-    band: tuple[float, float]
-
-
-def nees_over_time(
-    errors: TrajectoryErrors, covariances: FloatArray, is_anchored: bool
-) -> NeesOverTime | None:
-    """Return the NEES of the k poses that the truth covers; None where all are known exactly.
-
-    ``covariances`` (k, 6, 6) are of rotation vector and position along the estimate's axes. If it
-    ``is_anchored`` the truth is moved onto the first pose, as for the ANEES; else the errors are
-    those after the alignment.
-    """
-    poses = errors.estimate.moved(se3.inverse(errors.alignment)).poses
-    true_poses = errors.aligned_truth.poses
-    if is_anchored:
-        true_poses = poses[0] @ se3.inverse(true_poses[0]) @ true_poses
-    nees, degrees_of_freedom = normalised_squared_errors(
-        pose_errors(poses, true_poses), covariances
-    )
-    known = degrees_of_freedom > 0
-    if not known.any():
-        return None
-    return NeesOverTime(
-        errors.estimate.stamps_ns[known],
-        nees[known] / degrees_of_freedom[known],
-        average_nees_band(int(degrees_of_freedom.max()), 1),
-    )
-
-
 def _nees_of_anchor(estimate: Trajectory, covariances: FloatArray) -> float:
     """Return what the first pose's error adds to the ANEES if the truth is moved onto it.
 
@@ -152,38 +112,6 @@ def _nees_of_anchor(estimate: Trajectory, covariances: FloatArray) -> float:
     moved = shifts + np.cross(turns, arms[:, None])
     errors = np.concatenate([np.broadcast_to(turns, moved.shape), moved], axis=2)
     return average_nees(errors, covariances[:, None]) or 0.0
-
-
-_ROUNDING = 1e-9
-"""Singular values below this part of the largest are of motions that change no point."""
-
-
-def shape_covariances(points: FloatArray, joint: FloatArray) -> FloatArray:
-    """Return the covariance (n, 3, 3) of each landmark once the map is aligned with the true one.
-
-    A rigid motion of the whole map is no error of its shape: what it explains is taken out of
-    ``joint`` (n k, n k), the covariance of the first k coordinates of ``points`` (n, 3), in whose
-    axes the result is; metres, m².
-    """
-    n, k = len(points), len(joint) // len(points)
-    motions = _rigid_motions(points - points.mean(axis=0), k)
-    # With the projector Π = I − M Mᵀ on what no motion explains, the blocks of Π joint Π.
-    explained = joint @ motions
-    rows, of_motions = explained.reshape(n, k, -1), motions.reshape(n, k, -1)
-    crossed = rows @ of_motions.swapaxes(1, 2)
-    both = of_motions @ (motions.T @ explained) @ of_motions.swapaxes(1, 2)
-    covariances = np.zeros((n, 3, 3))
-    covariances[:, :k, :k] = diagonal_blocks(joint, k) - crossed - crossed.swapaxes(1, 2) + both
-    return covariances
-
-
-def _rigid_motions(centred: FloatArray, k: int) -> FloatArray:
-    """Return an orthonormal basis (n k, g) of what small rigid motions do to points (n, 3)."""
-    shifts = np.broadcast_to(np.eye(k), (len(centred), k, k))
-    turns = -so3.hat(centred)[:, :k, :] if k == 3 else -so3.hat(centred)[:, :2, 2:]
-    motions = np.concatenate([shifts, turns], axis=2).reshape(len(centred) * k, -1)
-    U, sizes, _ = np.linalg.svd(motions, full_matrices=False)
-    return np.asarray(U[:, sizes > _ROUNDING * sizes[0]])
 
 
 CHI_SQUARE_95 = 5.991464547107979

@@ -1,24 +1,19 @@
 """How all figures are drawn: without pyplot, so that nobody's settings change.
 
-Colours are those of Okabe and Ito, which colour-blind readers can distinguish. Names stand beside
-the points of a figure where there is room for them.
+Colours are those of Okabe and Ito, which colour-blind readers can distinguish.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
-from matplotlib.text import Annotation
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
-from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.common.types import FloatArray
 
 BLUE, RED, GREEN = '#0072B2', '#D55E00', '#009E73'
 ORANGE, PURPLE, BLACK = '#E69F00', '#CC79A7', '#1B1F24'
@@ -27,7 +22,7 @@ PALE_BLUE = '#7FB8DA'
 # The dictionaries are Any: matplotlib's types list the settings of its own version only.
 STYLE: Any = {
     'figure.constrained_layout.use': True,
-    'figure.dpi': 150,  # also before it is saved: where there is room is measured then
+    'figure.dpi': 150,
     'savefig.dpi': 'figure',
     'font.size': 10,
     'axes.titlesize': 11,
@@ -71,19 +66,10 @@ TRACKS: Any = {
     'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2,
     'label': 'landmark estimates on their way',
 }  # fmt: skip
-ELLIPSES: Any = {
-    'color': GREEN, 'linestyle': '-', 'linewidth': 0.9, 'zorder': 3.5,
-    'label': '95 % ellipses',
-}  # fmt: skip
 LANDMARKS: Any = {
     'color': GREEN, 'marker': 'o', 'markersize': 9, 'markerfacecolor': 'none',
     'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5, 'label': 'estimated landmarks',
 }  # fmt: skip
-LINKS: Any = {'color': '#333333', 'linestyle': '-', 'linewidth': 0.9, 'zorder': 4.5}
-LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
-
-_FEW_DECADES = 300.0
-"""Ratio of the limits of a logarithmic axis up to which there is room for 1, 2 and 5."""
 
 _PLANAR_RATIO = 0.01
 """A scene lower than this part of its width is drawn from above."""
@@ -110,15 +96,6 @@ def legend_below(figure: Figure, named: Axes, columns: int) -> None:
     layout.set(rect=(0.0, height, 1.0, 1.0 - height))
 
 
-def plain_decades(axes: Axes) -> None:
-    """Write numbers as 0.5 and 20 on a logarithmic axis, whose limits are set, not as powers."""
-    low, high = axes.get_ylim()
-    subs = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
-    axes.yaxis.set_major_locator(LogLocator(subs=subs))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _position: f'{value:g}'))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-
-
 def save(figure: Figure, path: Path) -> Path:
     """Write a file of one of SUFFIXES, return its path; raise an EvaluationError if that fails."""
     suffix = path.suffix.removeprefix('.')
@@ -127,95 +104,3 @@ def save(figure: Figure, path: Path) -> Path:
     except OSError as error:
         raise EvaluationError(f"can't write {path}: {error.strerror}") from error
     return path
-
-
-_MARKER_PT = 5.5
-"""Radius of a marker."""
-
-_GAP_PT = 1.0
-"""Room between a marker and its label."""
-
-_NEAR_PT = 14.0
-"""Markers nearer than this touch: of several it matters where their middle is."""
-
-_HALO_PT = 1.25
-"""What a label erases round itself."""
-
-_ANGLES = np.arange(16) * np.pi / 8.0
-_DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
-"""(16, 2) where a label may be, seen from its point."""
-
-
-def label_points(
-    axes: Axes, names: Sequence[str], points: FloatArray, markers: FloatArray
-) -> None:
-    """Write each name beside its point, if there it hits no marker and no name written before.
-
-    Of all sides that is tried first which leads away from what else is drawn near it. The layout
-    of the figure must be done. The names are those of ``points`` (n, 2), the most important ones
-    first; ``markers`` (m, 2) must not be hit, and have the points among them.
-    """
-    px = axes.figure.dpi / 72.0
-    obstacles = axes.transData.transform(markers)
-    middles, halves = np.empty((2, 0, 2))  # of the labels that were written
-    for name, point in zip(names, points, strict=True):
-        label = _label(axes, name, point)
-        half = np.array(label.get_window_extent().size) / 2.0 + _HALO_PT * px
-        start = axes.transData.transform(point)
-        candidates = start + _ways_to_middle(
-            half, _way_from_others(start, obstacles, _NEAR_PT * px), px
-        )
-        free = np.all(np.abs(candidates - axes.bbox.min) >= half, axis=1)
-        free &= np.all(np.abs(axes.bbox.max - candidates) >= half, axis=1)
-        free &= ~_hits_label(candidates, half, middles, halves)
-        free &= ~_touches_marker(candidates, half, obstacles, _MARKER_PT * px)
-        if not free.any():
-            label.remove()
-            continue
-        middle = candidates[np.argmax(free)]
-        label.xyann = tuple((middle - start) / px)
-        middles, halves = np.vstack([middles, middle]), np.vstack([halves, half])
-
-
-def _label(axes: Axes, name: str, point: FloatArray) -> Annotation:
-    return axes.annotate(
-        name,
-        (point[0], point[1]),
-        xytext=(0.0, 0.0),
-        textcoords='offset points',
-        horizontalalignment='center',
-        verticalalignment='center',
-        fontsize=8,
-        color='#004D38',
-        zorder=3,  # above paths, below markers
-        path_effects=[withStroke(linewidth=2.0 * _HALO_PT, foreground='white')],
-    )
-
-
-def _ways_to_middle(half: FloatArray, away: FloatArray, px: float) -> FloatArray:
-    """Return the ways (16, 2) from a marker to the middle of its label, the best one first."""
-    directions = _DIRECTIONS[np.argsort(-_DIRECTIONS @ away, kind='stable')]
-    to_middle = np.clip(np.sqrt(2.0) * directions, -1.0, 1.0) * half
-    return np.asarray((_MARKER_PT + _GAP_PT) * px * directions + to_middle)
-
-
-def _way_from_others(point: FloatArray, markers: FloatArray, near: float) -> FloatArray:
-    """Return the way (2,) that leads away from markers (m, 2), the nearest above all."""
-    apart = point - markers
-    return np.asarray((apart / (np.sum(apart**2, axis=1, keepdims=True) + near**2)).sum(axis=0))
-
-
-def _hits_label(
-    candidates: FloatArray, half: FloatArray, middles: FloatArray, halves: FloatArray
-) -> BoolArray:
-    """Return at which candidates (k, 2) a label would hit one that is written."""
-    apart = np.abs(candidates[:, None] - middles)
-    return np.asarray(np.any(np.all(apart < half + halves, axis=-1), axis=-1))
-
-
-def _touches_marker(
-    candidates: FloatArray, half: FloatArray, obstacles: FloatArray, radius: float
-) -> BoolArray:
-    """Return at which candidates (k, 2) a label would touch a marker."""
-    apart = np.maximum(np.abs(candidates[:, None] - obstacles) - half, 0.0)
-    return np.asarray(np.any(np.linalg.norm(apart, axis=-1) < radius, axis=-1))

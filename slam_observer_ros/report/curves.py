@@ -6,13 +6,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.consistency import (
     average_nees_band,
     CHI_SQUARE_95,
     normalised_squared_errors,
 )
 from slam_observer_ros.runs.reported_run import ReportedRun
+
+MAX_PATH = 4000
+"""Poses that are drawn, of the path and of its errors."""
 
 MAX_GROUPS = 150
 """Points of the curve of NIS, each the mean of as many observations as that takes."""
@@ -21,7 +24,10 @@ MIN_GROUP = 10
 
 
 def errors(run: ReportedRun) -> dict[str, Json]:
-    """Return position errors and the half-axis of the stated 95 % ellipse, metres."""
+    """Return position errors and the half-axis of the stated 95 % ellipse, metres.
+
+    The heading errors are in degrees, after the alignment.
+    """
     seconds = run.instants_s
     curves: dict[str, Json] = {
         't': rounded(seconds, 2),
@@ -29,6 +35,22 @@ def errors(run: ReportedRun) -> dict[str, Json]:
         'lyapunov_t': rounded(run.seconds(run.innovations.update_stamps_ns), 2),
         'lyapunov': _log10(run.innovations.lyapunov),
     }
+    if run.errors is not None:
+        curves['heading_t'], curves['heading_deg'] = _over_time(
+            run, run.errors.estimate.stamps_ns, np.degrees(run.errors.errors[:, 2])
+        )
+    if run.smoothed_errors is not None:
+        stamps_ns = run.smoothed_errors.estimate.stamps_ns
+        curves['smoothed_t'], curves['smoothed_m'] = _over_time(
+            run, stamps_ns, run.smoothed_errors.distances_m
+        )
+        _, curves['smoothed_heading_deg'] = _over_time(
+            run, stamps_ns, np.degrees(run.smoothed_errors.errors[:, 2])
+        )
+    if run.configuration.values_m:
+        curves['configuration_t'], curves['configuration_m'] = _over_time(
+            run, np.array(run.configuration.stamps_ns), np.array(run.configuration.values_m)
+        )
     anchored = run.anchored_errors()
     if anchored is not None:
         of_poses, rows = anchored
@@ -36,6 +58,17 @@ def errors(run: ReportedRun) -> dict[str, Json]:
         error_m[rows] = np.linalg.norm(of_poses[:, 3:], axis=1)
         curves['drift_m'] = rounded(error_m, 3)
     return curves
+
+
+def _over_time(run: ReportedRun, stamps_ns: IntArray, values: FloatArray) -> tuple[Json, Json]:
+    """Return seconds of the run and values at these, of no more than MAX_PATH stamps (k,)."""
+    some = thinned(len(stamps_ns), MAX_PATH)
+    return rounded(run.seconds(stamps_ns[some]), 2), rounded(values[some], 3)
+
+
+def thinned(count: int, most: int) -> slice:
+    """Return rows at equal steps, of ``count`` no more than ``most``."""
+    return slice(None, None, max(1, -(-count // most)))
 
 
 def _log10(values: FloatArray) -> Json:

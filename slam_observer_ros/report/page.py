@@ -17,7 +17,16 @@ from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.evaluation.trajectory import interpolate
-from slam_observer_ros.report.curves import calibration, consistency, drops, errors, Json, rounded
+from slam_observer_ros.report.curves import (
+    calibration,
+    consistency,
+    drops,
+    errors,
+    Json,
+    MAX_PATH,
+    rounded,
+    thinned,
+)
 from slam_observer_ros.runs.reported_run import ReportedRun
 from slam_observer_ros.settings.parameter_table import changed_names, table
 
@@ -64,7 +73,6 @@ def asset(name: str) -> str:
     return (resources.files(__package__) / 'assets' / name).read_text(encoding='utf-8')
 
 
-MAX_PATH = 4000
 MAX_RESIDUALS = 6000
 MAX_ELLIPSES = 40_000
 """Landmarks of all instants together that are drawn."""
@@ -89,6 +97,7 @@ def report_data(run: ReportedRun) -> dict[str, Json]:
         'gaps': rounded(run.gaps_s, 2),
         'path': _path(run),
         'instants': _instants(run),
+        'smoothed': _smoothed(run),
         'landmarks': _landmarks(run),
         'true_landmarks': _true_landmarks(run),
         'errors': errors(run),
@@ -117,13 +126,9 @@ def _is_flat(run: ReportedRun) -> bool:
     return bool(extent[2] <= FLAT * max(extent[0], extent[1]))
 
 
-def _thinned(count: int, most: int) -> slice:
-    return slice(None, None, max(1, -(-count // most)))
-
-
 def _path(run: ReportedRun) -> dict[str, Json]:
     trajectory = run.trajectory
-    some = _thinned(len(trajectory), MAX_PATH)
+    some = thinned(len(trajectory), MAX_PATH)
     stamps_ns, positions = trajectory.stamps_ns[some], trajectory.positions[some]
     path: dict[str, Json] = {
         't': rounded(run.seconds(stamps_ns), 2),
@@ -136,10 +141,18 @@ def _path(run: ReportedRun) -> dict[str, Json]:
     return path
 
 
+def _smoothed(run: ReportedRun) -> Json:
+    """Return the smoothed path and map in the world of the estimate; None if not asked for."""
+    if run.smoothed is None or run.smoothed_points is None:
+        return None
+    positions = run.smoothed.positions[thinned(len(run.smoothed), MAX_PATH)]
+    return {'xyz': rounded(positions.T, 3), 'points': rounded(run.smoothed_points.T, 3)}
+
+
 def _instants(run: ReportedRun) -> dict[str, Json]:
     """Return robot and map at instants, with the covariances of their positions."""
     total = sum(len(instant.ids) for instant in run.instants)
-    some = run.instants[_thinned(total, MAX_ELLIPSES)]
+    some = run.instants[thinned(total, MAX_ELLIPSES)]
     seconds = run.seconds(np.array([instant.stamp_ns for instant in some], dtype=np.int64))
     poses = np.array([instant.pose for instant in some]).reshape(-1, 4, 4)
     return {
@@ -238,8 +251,8 @@ def _shown(weights: FloatArray, distances: FloatArray) -> BoolArray:
     if len(weights) <= MAX_RESIDUALS:
         return np.ones(len(weights), dtype=np.bool_)
     suspicious = np.flatnonzero((weights < 1.0) | (distances > 3.0))
-    suspicious = suspicious[_thinned(len(suspicious), MAX_RESIDUALS // 2)]
+    suspicious = suspicious[thinned(len(suspicious), MAX_RESIDUALS // 2)]
     shown = np.zeros(len(weights), dtype=np.bool_)
-    shown[_thinned(len(weights), MAX_RESIDUALS // 2)] = True
+    shown[thinned(len(weights), MAX_RESIDUALS // 2)] = True
     shown[suspicious] = True
     return shown

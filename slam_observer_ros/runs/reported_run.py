@@ -215,6 +215,7 @@ class ReportedRun:
 
     ``trajectory`` is the online one and ``errors`` its errors; ``dead_reckoning`` is that of the
     velocities alone; ``anees`` is that of the pose. Both are None where there is no truth.
+    ``smoothed`` is None unless smoothing was asked for, ``smoothed_errors`` without truth, too.
     """
 
     settings: Settings
@@ -225,8 +226,12 @@ class ReportedRun:
     truth: Truth
     errors: TrajectoryErrors | None
     anees: float | None
+    configuration: ConfigurationError
     instants: Sequence[Instant]
     innovations: Innovations
+    smoothed: Trajectory | None = None
+    smoothed_points: FloatArray | None = None  # (n, 3) landmarks, metres, world
+    smoothed_errors: TrajectoryErrors | None = None
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Return times since the first event of the run, seconds."""

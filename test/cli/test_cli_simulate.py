@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
@@ -101,12 +103,72 @@ def test_recording_converges_as_the_simulation_did(slam_observer, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
 
 
+@pytest.fixture
+def short():
+    """The words of a short simulation."""
+    return 'simulate', '--step', 0.1, '--duration', 2
+
+
 def test_figures(slam_observer, tmp_path):
     figures = tmp_path / 'figures'
     slam_observer.succeed('simulate', '--step', 0.1, '--duration', 20, '--plot', figures)
     assert {path.name for path in figures.iterdir()} == {'lyapunov.png', 'configuration.png'}
     for path in figures.iterdir():
         assert path.read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.parametrize('kind', ['svg', 'pdf'])
+def test_figures_are_of_the_kind_that_is_asked_for(slam_observer, short, tmp_path, kind):
+    slam_observer.succeed(*short, '--plot', tmp_path / 'a', '--plot-format', kind)
+    names = {path.name for path in (tmp_path / 'a').iterdir()}
+    assert names == {f'lyapunov.{kind}', f'configuration.{kind}'}
+
+
+def test_figures_replace_others_by_force_alone_and_leave_other_files(
+    slam_observer, short, tmp_path
+):
+    notes, mine = tmp_path / 'notes.txt', tmp_path / 'lyapunov.png'
+    for path in (notes, mine):
+        path.write_text('mine')
+    assert '--force' in slam_observer.fail(*short, '--plot', tmp_path)
+    assert mine.read_text() == 'mine'
+    slam_observer.succeed(*short, '--plot', tmp_path, '--force')
+    assert mine.read_bytes().startswith(b'\x89PNG')
+    assert notes.read_text() == 'mine'
+    assert not list(tmp_path.glob('.*'))
+
+
+def test_figures_go_where_a_link_leads(slam_observer, short, tmp_path):
+    figures, elsewhere = tmp_path / 'figures', tmp_path / 'elsewhere.png'
+    figures.mkdir()
+    elsewhere.write_text('older')
+    (figures / 'lyapunov.png').symlink_to(elsewhere)
+    slam_observer.succeed(*short, '--force', '--plot', figures)
+    assert (figures / 'lyapunov.png').is_symlink()
+    assert elsewhere.read_bytes().startswith(b'\x89PNG')
+
+
+def test_what_is_no_file_is_replaced_by_no_figure(slam_observer, short, tmp_path):
+    pipe = tmp_path / 'lyapunov.png'
+    os.mkfifo(pipe)
+    error = slam_observer.fail(*short, '--force', '--plot', tmp_path)
+    assert f'{pipe} is there, and no regular file' in error
+    assert pipe.is_fifo()
+
+
+def test_figures_that_can_not_be_written_are_named_as_asked_for(slam_observer, short):
+    errors = slam_observer(*short, '--plot', '/proc/figures').errors
+    assert "can't write figures to /proc/figures: " in errors
+    assert 'unfinished' not in errors
+
+
+def test_where_no_figure_may_be_written_is_reported_before_the_work(
+    slam_observer, short, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(os, 'access', lambda *_: False)  # root may write anywhere
+    ended = slam_observer(*short, '--plot', tmp_path / 'new')
+    assert (ended.code, ended.output) == (2, '')
+    assert f'nothing may be written to {tmp_path}' in ended.errors
 
 
 class TestSlope:

@@ -203,16 +203,16 @@ class TestPoseInMapNotKnown:
         self, slam_observer, tmp_path, saved, more
     ):
         other = record(tmp_path / 'other.mcap', np.eye(4), seed=2, first_id=lambda step: 100)
-        poses, figures, before = tmp_path / 'poses.tum', tmp_path / 'figures', saved.read_bytes()
+        poses, page, before = tmp_path / 'poses.tum', tmp_path / 'run.html', saved.read_bytes()
         error = slam_observer.fail(
             'replay', other, '--load-map', saved, '--map', saved, '--tum', poses, '--force',
-            '--plot', figures, *SETTINGS, *more,
+            '--report', page, *SETTINGS, *more,
         )  # fmt: skip
         for text in (str(saved), 'not found', 'three of its landmarks', '0 of its 50'):
             assert text in error
         assert saved.read_bytes() == before
         assert not poses.exists()
-        assert not figures.exists()
+        assert not page.exists()
 
     def test_a_start_that_is_given_takes_no_ids(self, slam_observer, tmp_path, saved):
         start = se3.exp(np.array([0.0, 0.0, 1.0, 1.0, -2.0, 0.0]))

@@ -1,9 +1,8 @@
-"""What a replay writes: trajectory, map and figures, smoothed or not, and what it replaces."""
+"""What a replay writes: trajectory and map, smoothed or not, and what it replaces."""
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
 import re
 
 import numpy as np
@@ -16,11 +15,9 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 
 
 class TestOutputs:
-    def test_trajectory_and_map_and_figures(self, slam_observer, simulated, tmp_path):
-        tum, landmarks, figures = tmp_path / 'run.tum', tmp_path / 'map.yaml', tmp_path / 'figures'
-        slam_observer.succeed(
-            'replay', simulated, '--tum', tum, '--map', landmarks, '--plot', figures
-        )
+    def test_trajectory_and_map(self, slam_observer, simulated, tmp_path):
+        tum, landmarks = tmp_path / 'run.tum', tmp_path / 'map.yaml'
+        slam_observer.succeed('replay', simulated, '--tum', tum, '--map', landmarks)
         trajectory = read_tum(tum)
         assert len(trajectory) == 84  # 20 Hz at most, of stamps every 20 ms: every 60 ms
         assert np.diff(trajectory.stamps_ns).min() >= 50_000_000
@@ -29,17 +26,6 @@ class TestOutputs:
         assert [landmark['id'] for landmark in content['landmarks']] == [0, 1, 2, 3]
         assert all(len(landmark['position']) == 3 for landmark in content['landmarks'])
         assert content['landmarks'][0]['observations'] == 251
-        assert {path.name for path in figures.iterdir()} == {
-            'map.png', 'errors.png', 'residuals.png'
-        }  # fmt: skip
-
-    @pytest.mark.parametrize('kind', ['svg', 'pdf'])
-    def test_figures_are_of_the_kind_that_is_asked_for(
-        self, slam_observer, simulated, tmp_path, kind
-    ):
-        slam_observer.succeed('replay', simulated, '--plot', tmp_path / 'a', '--plot-format', kind)
-        names = {path.name for path in (tmp_path / 'a').iterdir()}
-        assert names == {f'{name}.{kind}' for name in ('map', 'errors', 'residuals')}
 
     def test_people_read_degrees_and_programs_radians(self, slam_observer, simulated):
         figures = slam_observer.succeed('replay', simulated, '--json').json
@@ -63,16 +49,13 @@ class TestOutputs:
                 assert np.linalg.eigvalsh(landmark['covariance']).min() > 0.0
 
     def test_nothing_is_overwritten_but_by_force(self, slam_observer, simulated, tmp_path):
-        figures = tmp_path / 'figures'
-        figures.mkdir()
-        files = {'--tum': tmp_path / 'a.tum', '--map': tmp_path / 'a.yaml', '--plot': figures}
-        for option, path in files.items():
-            mine = path / 'map.png' if path == figures else path
-            mine.write_text('mine')
+        for option, name in (('--tum', 'a.tum'), ('--map', 'a.yaml'), ('--report', 'a.html')):
+            path = tmp_path / name
+            path.write_text('mine')
             assert '--force' in slam_observer.fail('replay', simulated, option, path)
-            assert mine.read_text() == 'mine'
+            assert path.read_text() == 'mine'
             slam_observer.succeed('replay', simulated, option, path, '--force')
-            assert b'mine' not in mine.read_bytes()[:4]
+            assert b'mine' not in path.read_bytes()[:4]
 
     def test_what_is_read_is_not_replaced_even_by_force(
         self, slam_observer, simulated, tmp_path, monkeypatch
@@ -124,28 +107,26 @@ class TestOutputs:
     def test_links_stay_links_to_what_is_written(self, slam_observer, simulated, tmp_path):
         elsewhere = tmp_path / 'elsewhere'
         elsewhere.mkdir()
-        names = 'a.tum', 'map.yaml', 'figures/map.png'
-        (tmp_path / 'figures').mkdir()
+        names = 'a.tum', 'map.yaml', 'run.html'
         for name in names:
-            (elsewhere / Path(name).name).write_text('older')
-            (tmp_path / name).symlink_to(elsewhere / Path(name).name)
+            (elsewhere / name).write_text('older')
+            (tmp_path / name).symlink_to(elsewhere / name)
         slam_observer.succeed(
             'replay', simulated, '--force', '--tum', tmp_path / 'a.tum',
-            '--map', tmp_path / 'map.yaml', '--plot', tmp_path / 'figures',
+            '--map', tmp_path / 'map.yaml', '--report', tmp_path / 'run.html',
         )  # fmt: skip
         for name in names:
             assert (tmp_path / name).is_symlink()
-            assert b'older' not in (elsewhere / Path(name).name).read_bytes()
+            assert (elsewhere / name).read_bytes() != b'older'
         assert len(list(elsewhere.iterdir())) == 3
 
-    @pytest.mark.parametrize('option', ['--tum', '--map', '--plot'])
+    @pytest.mark.parametrize('option', ['--tum', '--map', '--report'])
     def test_what_is_no_file_is_not_replaced_even_by_force(
         self, slam_observer, simulated, tmp_path, option
     ):
-        pipe = tmp_path / 'map.png'
+        pipe = tmp_path / 'pipe'
         os.mkfifo(pipe)
-        path = tmp_path if option == '--plot' else pipe
-        error = slam_observer.fail('replay', simulated, '--force', option, path)
+        error = slam_observer.fail('replay', simulated, '--force', option, pipe)
         assert f'{pipe} is there, and no regular file' in error
         assert pipe.is_fifo()
 
@@ -154,24 +135,7 @@ class TestOutputs:
         outputs = ('--tum', tmp_path / 'link', '--map', tmp_path / 'map.yaml')
         assert 'two outputs' in slam_observer.fail('replay', simulated, *outputs)
 
-    def test_figures_that_can_not_be_written_are_named_as_asked_for(
-        self, slam_observer, simulated
-    ):
-        errors = slam_observer('replay', simulated, '--plot', '/proc/figures').errors
-        assert "can't write figures to /proc/figures: " in errors
-        assert 'unfinished' not in errors
-
-    def test_figures_of_an_earlier_replay_are_not_left_among_the_new_ones(
-        self, slam_observer, simulated, tmp_path
-    ):
-        slam_observer.succeed('replay', simulated, '--plot', tmp_path)
-        assert (tmp_path / 'errors.png').exists()
-        without_truth = recordings.write_events(tmp_path / 'run.mcap', recordings.events())
-        slam_observer.succeed('replay', without_truth, '--plot', tmp_path, '--force')
-        assert not (tmp_path / 'errors.png').exists()
-        assert (tmp_path / 'map.png').exists()
-
-    @pytest.mark.parametrize('option', ['--tum', '--map', '--plot'])
+    @pytest.mark.parametrize('option', ['--tum', '--map', '--report'])
     def test_where_nothing_may_be_written_is_reported_before_the_work(
         self, slam_observer, simulated, tmp_path, option, monkeypatch
     ):
@@ -179,13 +143,6 @@ class TestOutputs:
         ended = slam_observer('replay', simulated, option, tmp_path / 'new')
         assert (ended.code, ended.output) == (2, '')
         assert f'nothing may be written to {tmp_path}' in ended.errors
-
-    def test_figures_leave_other_files_alone(self, slam_observer, simulated, tmp_path):
-        (tmp_path / 'notes.txt').write_text('mine')
-        slam_observer.succeed('replay', simulated, '--plot', tmp_path)
-        assert (tmp_path / 'notes.txt').read_text() == 'mine'
-        assert (tmp_path / 'map.png').exists()
-        assert not list(tmp_path.glob('.*'))
 
 
 class TestSmoothing:
@@ -196,10 +153,10 @@ class TestSmoothing:
         online = slam_observer.succeed(
             'replay', simulated, '--gains', 'riccati', '--json', '--tum', online_tum
         ).json
-        tum, landmarks, figures = tmp_path / 'a.tum', tmp_path / 'a.yaml', tmp_path / 'figures'
+        tum, landmarks = tmp_path / 'a.tum', tmp_path / 'a.yaml'
         report = slam_observer.succeed(
             'replay', simulated, '--gains', 'riccati', '--json', '--smooth',
-            '--tum', tum, '--map', landmarks, '--plot', figures,
+            '--tum', tum, '--map', landmarks,
         ).json  # fmt: skip
         assert report['ate_rmse_m'] == online['ate_rmse_m']
         assert report['smoothed_ate_rmse_m'] < online['ate_rmse_m']
@@ -208,7 +165,6 @@ class TestSmoothing:
         # At the same stamps, also where nothing is seen.
         np.testing.assert_array_equal(read_tum(tum).stamps_ns, read_tum(online_tum).stamps_ns)
         assert len(yaml.safe_load(landmarks.read_text())['landmarks']) == 4
-        assert len(list(figures.iterdir())) == 3
 
     def test_gains_without_a_history_can_not_smooth(self, slam_observer, simulated):
         error = slam_observer.fail('replay', simulated, '--smooth', '--gains', 'constant')

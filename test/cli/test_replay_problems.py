@@ -187,15 +187,15 @@ class TestRecordingsWithProblems:
     def test_without_any_observation_nothing_is_smoothed_or_written(
         self, slam_observer, unplaced, tmp_path
     ):
-        tum, landmarks, figures = tmp_path / 'a.tum', tmp_path / 'a.yaml', tmp_path / 'figures'
+        tum, landmarks, page = tmp_path / 'a.tum', tmp_path / 'a.yaml', tmp_path / 'a.html'
         ended = slam_observer(
             'replay', unplaced, '--smooth', '--gains', 'riccati',
-            '--tum', tum, '--map', landmarks, '--plot', figures,
+            '--tum', tum, '--map', landmarks, '--report', page,
         )  # fmt: skip
         assert (ended.code, ended.output) == (2, '')
         last = ended.errors.splitlines()[-1]
         assert 'error: no observation was used (dropped: 50 no_transform)' in last
-        assert not any(path.exists() for path in (tum, landmarks, figures))
+        assert not any(path.exists() for path in (tum, landmarks, page))
 
     def test_two_topics_that_fit_are_listed_with_the_option_that_decides(
         self, slam_observer, tmp_path

@@ -9,10 +9,10 @@ from pathlib import Path
 import re
 import shutil
 
-from browser import open_page
+from browser import open_page, Opened
 import numpy as np
 import pytest
-from recordings import events, MESSAGE_COUNT, SAMPLE, write_mcap
+from recordings import events, MESSAGE_COUNT, SAMPLE, write_events, write_mcap
 
 from slam_observer_ros import __version__
 from slam_observer_ros.cli.main import main
@@ -169,12 +169,17 @@ def test_the_slider_moves_to_the_time_in_the_address(report):
 
 def run_in_page(report: Path, script: str) -> str:
     """Return the title that a script, run in a report after it was drawn, has given to it."""
+    return re.search('<title>([^<]*)', opened_with(report, script).html).group(1)
+
+
+def opened_with(report: Path, script: str) -> Opened:
+    """Open a report with one script more, which runs after the report was drawn."""
     changed = report.with_name('changed.html')
     before, after = report.read_text().rsplit('</body>', 1)
     changed.write_text(f'{before}<script>{script}</script></body>{after}')
     opened = open_page(changed)
     assert opened.console == []
-    return re.search('<title>([^<]*)', opened.html).group(1)
+    return opened
 
 
 def test_motion_in_space_has_a_view_that_turns(report):
@@ -215,6 +220,75 @@ def test_on_paper_each_curve_is_a_figure_of_its_own(report):
         document.title = [onPaper > 3, curves.length > onPaper].join();
     """
     assert run_in_page(report, script) == 'true,true'
+
+
+@pytest.mark.parametrize('figure', ['map', 'side', 'curves'])
+def test_each_figure_is_saved_as_png_and_as_svg_with_white_paper(report, figure):
+    script = f"""
+        const files = {{}}, found = [], names = [], made = URL.createObjectURL;
+        URL.createObjectURL = (file) => {{
+          const url = made(file);
+          files[url] = file;
+          return url;
+        }};
+        HTMLAnchorElement.prototype.click = function () {{
+          names.push(this.download);
+          document.body.dataset.names = names.sort().join();
+          files[this.href].text().then((text) => {{
+            const isSvg = text.startsWith('<svg');
+            found.push(isSvg ? `svg ${{text.includes('rgb(255, 255, 255)')}}` : text.slice(1, 4));
+            document.title = found.sort().join();
+          }});
+        }};
+        document.querySelectorAll('#save-{figure} button').forEach((button) => button.click());
+    """
+    opened = opened_with(report, script)
+    assert re.search('<title>([^<]*)', opened.html).group(1) == 'PNG,svg true'
+    assert f'data-names="run_{figure}.png,run_{figure}.svg"' in opened.html
+
+
+def test_a_figure_that_is_saved_is_what_is_seen(report):
+    script = """
+        Plotly.downloadImage = ({ data, layout }, { width, height, scale }) => {
+          const map = document.getElementById('map');
+          document.title = [layout.xaxis.range, data[1].visible, width === map.clientWidth,
+            height === map.clientHeight, scale].join();
+        };
+        Plotly.relayout('map', { 'xaxis.range': [1, 2] }).then(() => {
+          document.getElementById('map').data[1].visible = 'legendonly';
+          document.querySelector('#save-map button').click();
+        });
+    """
+    assert run_in_page(report, script) == '1,2,legendonly,true,true,3'
+
+
+def test_what_is_smoothed_is_drawn_with_its_errors(slam_observer, reported, tmp_path):
+    report = tmp_path / 'run.html'
+    slam_observer.succeed('replay', reported / 'run.mcap', '--smooth', '--report', report)
+    numbers = numbers_of(report)
+    assert len(numbers['smoothed']['xyz'][0]) > 10
+    assert len(numbers['smoothed']['points'][0]) == len(numbers['landmarks'])
+    errors = numbers['errors']
+    assert len(errors['smoothed_t']) == len(errors['smoothed_m']) > 10
+    assert len(errors['smoothed_t']) == len(errors['smoothed_heading_deg'])
+    html = open_page(report).html
+    assert 'landmarks, smoothed' in html
+    assert 'error of the smoothed path' in html
+
+
+def test_errors_of_heading_and_configuration_are_drawn_where_there_is_truth(
+    slam_observer, report, tmp_path
+):
+    errors = numbers_of(report)['errors']
+    assert len(errors['heading_t']) == len(errors['heading_deg']) > 10
+    assert len(errors['configuration_t']) == len(errors['configuration_m']) > 10
+    without_truth, other = write_events(tmp_path / 'a.mcap', events()), tmp_path / 'a.html'
+    slam_observer.succeed('replay', without_truth, '--report', other)
+    assert not {'heading_t', 'configuration_t', 'smoothed_t'} & set(numbers_of(other)['errors'])
+    assert numbers_of(other)['smoothed'] is None
+    html = open_page(report).html
+    assert 'heading [°]' in html
+    assert 'configuration [m]' in html
 
 
 def test_landmarks_that_are_believed_moved_are_marked(slam_observer, tmp_path):

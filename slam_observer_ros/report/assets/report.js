@@ -15,15 +15,19 @@ const HEIGHTS = { large: 200, small: 130 };
 const PAPER = { width: 680, map: 400, side: 330 };
 const dark = matchMedia('(prefers-color-scheme: dark)');
 let printing = false;
+/* A figure that is saved is for paper, too, in the size that it has on the screen. */
+let saving = false;
 
 /** @param {string} id @returns {HTMLElement} */
 const element = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const slider = /** @type {HTMLInputElement} */ (element('slider'));
 
-function ink() { return dark.matches && !printing ? '#e6e9ee' : '#1b1f24'; }
+function isDark() { return dark.matches && !printing && !saving; }
+function ink() { return isDark() ? '#e6e9ee' : '#1b1f24'; }
 /* From blue to yellow, as Cividis; small values stay visible on paper and in the dark. */
-function scale() { return dark.matches && !printing ? [[0, '#4a74b5'], [0.5, '#9c9a8e'], [1, '#ffe945']] : [[0, '#f0d84a'], [0.5, '#7c7b78'], [1, '#00204d']]; }
-function grid() { return dark.matches && !printing ? '#39404a' : '#d5d9de'; }
+function scale() { return isDark() ? [[0, '#4a74b5'], [0.5, '#9c9a8e'], [1, '#ffe945']] : [[0, '#f0d84a'], [0.5, '#7c7b78'], [1, '#00204d']]; }
+function background() { return saving ? '#ffffff' : 'rgba(0,0,0,0)'; }
+function grid() { return isDark() ? '#39404a' : '#d5d9de'; }
 
 /* Half-axis of the ellipse that holds 95 % in a plane, in standard deviations. */
 const SIGMAS = Math.sqrt(5.991464547);
@@ -87,9 +91,8 @@ const extent = (() => {
   return Math.max(...all.map((v) => (v.length ? v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.max(a, b)) - v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.min(a, b)) : 1)), 0.1);
 })();
 
-/** @param {string} id @param {View} view */
-function drawMap(id, view) {
-  const isPlan = id === 'map';
+/** @param {boolean} isPlan @param {View} view */
+function mapFigure(isPlan, view) {
   const path = run.path, first = stateAt(Number(slider.value), view);
   const traces = [];
   if (path.true_xyz) {
@@ -105,6 +108,11 @@ function drawMap(id, view) {
   if (run.true_landmarks) {
     traces.push({ x: along(run.true_landmarks.xyz, view.across), y: along(run.true_landmarks.xyz, view.up), mode: 'markers', name: 'true landmarks', marker: { symbol: 'x-thin', size: 9, line: { color: ink(), width: 1.5 } }, text: run.true_landmarks.ids, hovertemplate: 'true landmark %{text}<extra></extra>' });
   }
+  if (run.smoothed) {
+    const { xyz, points } = run.smoothed;
+    traces.push({ x: along(xyz, view.across), y: along(xyz, view.up), mode: 'lines', name: 'smoothed', line: { color: PINK, width: 1.5 }, hoverinfo: 'skip' });
+    traces.push({ x: along(points, view.across), y: along(points, view.up), mode: 'markers', name: 'landmarks, smoothed', marker: { symbol: 'circle-open', size: 10, color: PINK }, hoverinfo: 'skip' });
+  }
   const still = traces.length;
   traces.push(
     { x: first.x[0], y: first.y[0], text: first.text[0], mode: 'markers+text', textposition: 'top right', name: 'landmarks', marker: { symbol: 'square', size: 7, color: GREEN }, hovertemplate: 'landmark %{text}<extra></extra>' },
@@ -114,14 +122,27 @@ function drawMap(id, view) {
     { x: first.x[4], y: first.y[4], mode: 'markers', name: 'robot', marker: { size: 10, color: RED, line: { color: '#fff', width: 1 } }, hoverinfo: 'skip' },
   );
   const axis = { gridcolor: grid(), zeroline: false, automargin: true };
-  Plotly.newPlot(id, traces, {
-    paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink() },
+  /** @type {any} */
+  const layout = {
+    paper_bgcolor: background(), plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink() },
     margin: { l: 50, r: 10, t: 10, b: 40 }, legend: { orientation: 'h', y: 1.02, yanchor: 'bottom', x: 0.5, xanchor: 'center' },
     xaxis: { ...axis, title: { text: axisName(view.across, 'across') }, constrain: 'domain' },
     yaxis: { ...axis, title: { text: axisName(view.up, 'up') }, scaleanchor: 'x', constrain: 'domain' },
     hovermode: 'closest', uirevision: 'kept', showlegend: isPlan,
     ...(printing ? { width: PAPER.width, height: isPlan ? PAPER.map : PAPER.side } : {}),
-  }, { responsive: !printing, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches ? undefined : false });
+  };
+  return { data: traces, layout, still };
+}
+
+/* The buttons below a figure save it as it is for paper; Plotly's own would keep the colours of the night. */
+function plotSettings() {
+  return { responsive: !printing, displaylogo: false, modeBarButtonsToRemove: ['toImage'], displayModeBar: matchMedia('(hover: hover)').matches && !printing ? undefined : false };
+}
+
+/** @param {string} id @param {View} view */
+function drawMap(id, view) {
+  const { data, layout, still } = mapFigure(id === 'map', view);
+  Plotly.newPlot(id, data, layout, plotSettings());
   element(id).dataset.still = String(still);
   /** @type {any} */ (element(id)).on('plotly_click', (/** @type {any} */ event) => {
     const t = event.points[0].customdata;
@@ -153,8 +174,16 @@ function rows() {
   const position = [];
   if (run.path.error_m) position.push(curve(run.path.t, run.path.error_m, 'error, aligned as for the ATE', { color: BLUE }));
   if (errors.drift_m) position.push(curve(errors.t, errors.drift_m, 'error from the first pose on', { color: RED }));
+  if (errors.smoothed_m) position.push(curve(errors.smoothed_t, errors.smoothed_m, 'error of the smoothed path, aligned', { color: PINK }));
   position.push(curve(errors.t, errors.bound_m, 'stated 95 %, from the first pose on', { color: ink(), dash: 'dash' }));
   all.push({ title: 'position [m]', traces: position, axis: { rangemode: 'tozero' } });
+  const heading = [];
+  if (errors.heading_deg) heading.push(curve(errors.heading_t, errors.heading_deg, 'error of the heading, aligned', { color: BLUE }));
+  if (errors.smoothed_heading_deg) heading.push(curve(errors.smoothed_t, errors.smoothed_heading_deg, 'smoothed', { color: PINK }));
+  if (heading.length) all.push({ title: 'heading [°]', traces: heading });
+  if (errors.configuration_m) {
+    all.push({ title: 'configuration [m]', small: true, traces: [curve(errors.configuration_t, errors.configuration_m, 'error of the landmarks as the robot sees them, not aligned', { color: GREEN })], axis: { rangemode: 'tozero' } });
+  }
   const ids = residuals.id;
   const moved = new Set(residuals.moved);
   /** @param {(w: number, i: number) => boolean} test @param {any} y @param {string} name @param {any} marker */
@@ -227,6 +256,12 @@ function drawCurves() {
 
 /** @param {HTMLElement} place @param {Row[]} all */
 function drawRows(place, all) {
+  const { data, layout } = rowsFigure(place, all);
+  Plotly.newPlot(place, data, layout, plotSettings());
+}
+
+/** @param {HTMLElement} place @param {Row[]} all */
+function rowsFigure(place, all) {
   const narrow = place.clientWidth < 700;
   /* Above each row there is room for its legend, a line for each name where they don't fit into one. */
   const spaces = all.map((row) => 28 + 18 * (narrow ? row.traces.filter((trace) => trace.showlegend !== false).length : 1));
@@ -236,7 +271,7 @@ function drawRows(place, all) {
   const now = run.instants.t[Number(slider.value)] || 0;
   /** @type {any} */
   const layout = {
-    height: total + 44, ...(printing ? { width: PAPER.width } : {}), paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink(), size: 12 },
+    height: total + 44, ...(printing ? { width: PAPER.width } : {}), paper_bgcolor: background(), plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink(), size: 12 },
     margin: { l: 62, r: 12, t: 4, b: 40 }, hovermode: 'closest', uirevision: 'kept',
     xaxis: { gridcolor: grid(), zeroline: false, title: { text: 'time [s]' }, anchor: `y${all.length > 1 ? all.length : ''}`, range: [0, end] },
     shapes: [{ type: 'line', xref: 'x', yref: 'paper', x0: now, x1: now, y0: 0, y1: 1, line: { color: RED, width: 1.5 } }].concat(run.gaps.map((/** @type {number[]} */ gap) => ({ type: 'rect', xref: 'x', yref: 'paper', x0: gap[0], x1: gap[1], y0: 0, y1: 1, line: { width: 0 }, fillcolor: 'rgba(128,128,128,0.18)', layer: 'below' }))),
@@ -253,7 +288,21 @@ function drawRows(place, all) {
     row.traces.forEach((trace) => traces.push({ ...trace, xaxis: 'x', yaxis: `y${name}`, legend: `legend${name}` }));
     top += heights[n];
   });
-  Plotly.newPlot(place, traces, layout, { responsive: !printing, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches && !printing ? undefined : false });
+  return { data: traces, layout };
+}
+
+/** Saves a figure as it is zoomed and chosen on the screen, black on white. @param {string} id @param {string} format */
+function save(id, format) {
+  const place = /** @type {any} */ (element(id));
+  saving = true;
+  const { data, layout } = id === 'curves' ? rowsFigure(place, rows()) : mapFigure(id === 'map', id === 'map' ? PLAN : chosenView());
+  saving = false;
+  data.forEach((/** @type {any} */ trace, /** @type {number} */ n) => { trace.visible = place.data[n].visible; });
+  for (const axis of Object.keys(layout).filter((name) => /^[xy]axis/.test(name))) {
+    layout[axis] = { ...layout[axis], range: [...place.layout[axis].range] };
+  }
+  const filename = `${run.title.replace(/\.[^.]*$/, '')}_${id}`;
+  return Plotly.downloadImage({ data, layout }, { format, width: place.clientWidth, height: place.clientHeight, scale: format === 'png' ? 3 : 1, filename });
 }
 
 /** @param {number} t seconds */
@@ -336,14 +385,19 @@ function write() {
 }
 
 function draw() {
-  if (!run.instants.t.length) { element('time-bar').hidden = true; return; }
+  if (!run.instants.t.length) { element('time-bar').hidden = true; saves.forEach((buttons) => { buttons.hidden = true; }); return; }
   drawMap('map', PLAN);
-  element('views').hidden = element('side').hidden = run.is_flat;
+  element('views').hidden = element('side').hidden = element('save-side').hidden = run.is_flat;
   if (!run.is_flat) drawMap('side', chosenView());
   drawCurves();
   update();
 }
 
+/** @type {NodeListOf<HTMLElement>} */
+const saves = document.querySelectorAll('.save');
+saves.forEach((buttons) => buttons.querySelectorAll('button').forEach((button) => {
+  button.addEventListener('click', () => save(buttons.id.replace('save-', ''), (button.textContent || '').toLowerCase()));
+}));
 write();
 slider.max = String(Math.max(run.instants.t.length - 1, 0));
 slider.value = slider.max;
