@@ -244,3 +244,19 @@ def test_a_second_localisation_on_tf_is_named(ros, tmp_path):
                 sender.send(('map', 'odom', np.eye(4)), stamp_ns=stamp)
             ros.spin_for(0.02)
         node.wait_for_output(r"another node publishes 'map' to 'odom' on /tf")
+
+
+def test_a_static_map_to_odom_is_named_too(ros, tmp_path):
+    sender = TransformSender(ros, '/static')
+    sender.send(('map', 'odom', np.eye(4)))
+    with (
+        running('observer_node', tmp_path / 'log', *own_topics('/static')) as node,
+        Robot(ros, namespace='/static') as robot,
+    ):
+        ros.wait_for_subscriber(sender.dynamic, sender.static)
+        for _ in range(100):
+            stamp = time.time_ns()
+            robot.send(VelocityEvent(stamp, np.zeros(6)))
+            sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=stamp)
+            ros.spin_for(0.02)
+        node.wait_for_output(r"another node publishes 'map' to 'odom' on /tf_static, too: end it")

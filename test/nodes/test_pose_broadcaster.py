@@ -253,3 +253,28 @@ def test_another_publisher_of_the_same_transform_is_named_until_it_ends(robot):
     assert robot.logged.count('another node publishes') == 1
     robot.run(10.0, lag_s=0.0)
     assert not robot.broadcaster.rival
+
+
+@pytest.mark.parametrize('first', [True, False])
+@pytest.mark.parametrize('parent', ['/map', 'world'])
+def test_a_static_transform_of_the_same_frame_is_named_whenever_it_was_heard(robot, first, parent):
+    if first:  # before it is known what is published from here
+        robot.broadcaster.hear(parent, 'odom', None)
+        assert not robot.broadcaster.rival
+    robot.run(1.0, lag_s=0.0)
+    if not first:
+        assert not robot.broadcaster.rival
+        robot.broadcaster.hear(parent, 'odom', None)
+    robot.run(20.0, lag_s=0.0)
+    name = parent.lstrip('/')
+    expected = f"another node publishes '{name}' to 'odom' on /tf_static, too: end it (it may be "
+    assert robot.broadcaster.rival.startswith(expected)
+    assert robot.logged.count('another node publishes') == 1
+
+
+def test_static_transforms_of_other_frames_are_no_rivals(robot):
+    for ends in (('world', 'map'), ('base_link', 'camera'), ('map', 'dock')):
+        robot.broadcaster.hear(*ends, None)
+    robot.run(1.0, lag_s=0.0)
+    assert not robot.broadcaster.rival
+    assert 'another node publishes' not in robot.logged

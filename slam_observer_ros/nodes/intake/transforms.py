@@ -29,8 +29,8 @@ class SentTransforms(Protocol):
     def is_own(self, raw: bytes) -> bool:
         """Return whether a message heard on /tf came from here; then it is not looked into."""
 
-    def hear(self, parent: str, child: str, stamp_ns: int) -> None:
-        """Take what was heard from others."""
+    def hear(self, parent: str, child: str, stamp_ns: int | None) -> None:
+        """Take what was heard from others; without stamp what is static."""
 
 
 class LiveTransforms:
@@ -85,9 +85,10 @@ class LiveTransforms:
                 finding = found('malformed_message', topic=f"'{topic}'", error=error)
                 self._log.warning(topic, finding.text())
                 return
-            if self._sent is not None and not is_static:
+            if self._sent is not None:
                 for each in transforms:
-                    self._sent.hear(each.frame_id, each.child_frame_id, each.stamp_ns)
+                    stamp_ns = None if is_static else each.stamp_ns
+                    self._sent.hear(each.frame_id, each.child_frame_id, stamp_ns)
             others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
             insert_transforms(self._buffer, others, is_static=is_static)
 

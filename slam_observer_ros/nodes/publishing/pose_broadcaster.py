@@ -104,6 +104,8 @@ class PoseBroadcaster:
         self._last_ns: int | None = None
         self._own_ns: deque[int] = deque(maxlen=OWN_STAMPS)
         self._rival_s = -RIVAL_S
+        self._rival = ''  # parent that it gives the frame
+        self._static: dict[str, str] = {}  # parents of frames on /tf_static
         self.problem = ''
 
     @property
@@ -124,25 +126,57 @@ class PoseBroadcaster:
         """Return whether a message heard on /tf is one of the last that were sent from here."""
         return raw in self._publisher.sent
 
-    def hear(self, parent: str, child: str, stamp_ns: int) -> None:
-        """Take a transform that was heard on /tf: nobody else may give the same frame a parent."""
-        ends = [self._settings.map_frame, self._child]
-        if [parent, child] != (ends[::-1] if self._settings.invert_tf else ends):
+    def hear(self, parent: str, child: str, stamp_ns: int | None) -> None:
+        """Take a transform that was heard: nobody else may give the same frame a parent.
+
+        One of /tf_static, which has no stamp here, holds for good, also where it is not known yet
+        what is to go out.
+        """
+        parent, child = parent.lstrip('/'), child.lstrip('/')
+        if stamp_ns is None:
+            self._static[child] = parent
+        elif self._is_rival(parent, child) and (
+            # Of its own the last ones are heard first.
+            parent != self._ends[0] or stamp_ns not in reversed(self._own_ns)
+        ):
+            self._rival_s, self._rival = time.monotonic(), parent
+        else:
             return
-        if stamp_ns not in reversed(self._own_ns):  # the last ones are heard first
-            self._rival_s = time.monotonic()
-            self._log.warning('another', self.rival)
+        self._report_rival()
 
     @property
     def rival(self) -> str:
         """Report another publisher of the transform that goes out here; empty if there is none."""
-        if not self._child or time.monotonic() - self._rival_s > RIVAL_S:
+        child = self._ends[1]
+        parent, topic, whose = self._rival, '/tf', 'another localisation'
+        if self._is_rival(self._static.get(child, ''), child):
+            parent, topic = self._static[child], '/tf_static'
+            whose = 'a static_transform_publisher of a launch file'
+        elif not self._child or time.monotonic() - self._rival_s > RIVAL_S:
             return ''
         return (
-            f"another node publishes '{self._settings.map_frame}' to '{self._child}' on /tf, too: "
-            'end it, as another localisation, give each robot its own frames, or set publish_tf '
-            'to false'
+            f"another node publishes '{parent}' to '{child}' on {topic}, too: end it (it may be "
+            f'{whose}), give each robot its own frames, or set publish_tf to false'
         )
+
+    def _is_rival(self, parent: str, child: str) -> bool:
+        """Return whether a transform gives a frame a parent that has its own from here.
+
+        The base may have others, for which :meth:`_other_parent` cares.
+        """
+        ends = self._ends
+        is_of_odometry = bool(parent) and self._child == self._settings.odom_frame
+        return bool(self._child) and child == ends[1] and (parent == ends[0] or is_of_odometry)
+
+    def _report_rival(self) -> None:
+        if rival := self.rival:
+            self._log.warning('another', rival)
+
+    @property
+    def _ends(self) -> tuple[str, str]:
+        """Parent and child of the transform that goes out here."""
+        ends = self._settings.map_frame, self._child
+        return ends[::-1] if self._settings.invert_tf else ends
 
     def retry(self) -> None:
         """Publish the newest pose that can be."""
@@ -250,6 +284,7 @@ class PoseBroadcaster:
             f"publishing '{settings.map_frame}' to '{child}' on /tf: "
             f"{reason} '{settings.odom_frame}' to '{settings.base_frame}'"
         )
+        self._report_rival()
 
     def _publish(self, stamp_ns: int, pose: FloatArray) -> None:
         if stamp_ns == self._last_ns:
