@@ -32,7 +32,6 @@ NEVER_RELINEARISED = {'relinearization_interval': 0}
 NO_SLIPS = {'unknown_angular_motion': 0.0, 'unknown_linear_motion': 0.0}
 """It has no other effect here: velocities have no gaps for which these figures count."""
 
-NO_DOUBTS = NO_SLIPS | {'max_hypotheses': 1}
 VELOCITIES = {'landmark_velocity_stddev': 0.04}
 """Root mean square of each component over all landmarks, a tenth of which move."""
 
@@ -142,12 +141,6 @@ _CASES: dict[str, Case] = {
         for run in ('MRCLAM 6', 'loop, wheeled', 'small loop, wheeled')
         for how, change in _MISHAPS.items()
         if not (run == 'MRCLAM 6' and how == 'carried')  # it does not drive on all the time
-    },
-    **{
-        f'ids in doubt: {run}, 5 % outliers': Case(
-            make, outliers.with_outliers, NO_SLIPS, NO_DOUBTS
-        )
-        for run, make in _RUNS.items()
     },
     **{
         f'landmark velocities: {run}, a tenth moves{which}': Case(make, change, VELOCITIES, {})

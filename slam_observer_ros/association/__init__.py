@@ -1,1 +1,1 @@
-"""What points without an id, or with a suspect one, may be, and where the robot is then."""
+"""What points without an id may be, and whether the robot has slipped."""

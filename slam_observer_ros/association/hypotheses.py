@@ -20,12 +20,10 @@ from slam_observer_ros.association.costs import NewLandmarks
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     as_its_ids_say,
-    consistent,
     Interpretation,
     interpretations,
-    is_ambiguous,
-    may_relabel,
-    noted,
+    is_contradicted,
+    may_name,
 )
 from slam_observer_ros.association.joint_compatibility import (
     pruning_cost,
@@ -43,7 +41,7 @@ from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import in_parts, usual
 from slam_observer_ros.state.matching import calibrated, match, MatchedObservation
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import disbelieve, step
+from slam_observer_ros.state.step import step
 
 MOST_WITHOUT_IDS = 2
 """Hypotheses that are followed at most where points have no ids: each costs as much as the first,
@@ -257,8 +255,8 @@ class Hypotheses:
             return step(self.best, match(self.best, event))
         matched = match(self.best, event) if len(self._all) == 1 else None
         if matched is not None and not unknown:
-            is_clear = self._limit == 1 or not is_ambiguous(self.best, matched)
-            if is_clear and not may_relabel(self.best, matched):
+            is_clear = self._limit == 1 or not is_contradicted(self.best, matched)
+            if is_clear and not may_name(self.best, matched):
                 return step(self.best, matched)
         # All hypotheses with all meanings; costs are differences to the most likely one.
         children = self._follow(event, self._interpret(event, matched))
@@ -302,15 +300,11 @@ class Hypotheses:
         """Let a hypothesis use an observation as one interpretation has it."""
         state, update = hypothesis.state, taken.update
         if update is None:
-            state.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
+            state.landmarks.renumber(taken.named_rows, taken.given_ids)
             update = step(state, taken.matched or match(state, taken.event))
-        if taken.disbelieved is not None:
-            disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
-        hypothesis.verdicts = noted(hypothesis.verdicts, state, taken, event)
         if (event.ids == UNKNOWN_ID).any():
             hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
-        state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
         return _Child(hypothesis, taken.event, update)
 
     def _interpret(
@@ -345,22 +339,16 @@ class Hypotheses:
         new_cost: float,
         budget: float,
     ) -> list[Interpretation]:
-        """Return what an observation may mean to a hypothesis: :func:`.interpretations`.
-
-        Of several, one that contradicts what it said before is given up, unless it is the best.
-        """
+        """Return what an observation may mean to a hypothesis: :func:`.interpretations`."""
         state, index = hypothesis.state, hypothesis.index
         seen = calibrated(state, event)
         if matched is not None:
             return interpretations(state, index, seen, matched, new_ids, new_cost, budget, True)
         used = in_parts.observe(state, event, with_expected=True)
         if used is not None:
-            found = [as_its_ids_say(state, seen, *used)]
-        else:
-            matched = match(state, seen)
-            found = interpretations(state, index, seen, matched, new_ids, new_cost, budget)
-        agreeing = consistent(hypothesis.verdicts, state, found, event)
-        return found if not agreeing and hypothesis is self._all[0] else agreeing
+            return [as_its_ids_say(state, seen, *used)]
+        matched = match(state, seen)
+        return interpretations(state, index, seen, matched, new_ids, new_cost, budget)
 
     def _new_ids(self, m: int) -> IntArray:
         """Return ids (m,) that no landmark of any hypothesis has, nor one of a loaded map."""
@@ -389,8 +377,6 @@ def are_one(
     They have if the points, and each landmark that either takes one of them for, have the same
     positions: which was which in this observation does not matter then.
     """
-    if not np.array_equal(_shown(event), _shown(other_event)):  # one takes some for outliers
-        return False
     # How far the points seen are from each other, and the landmarks they are taken for.
     here, there = state.observer.pose, other.observer.pose
     noise = here[:3, :3] @ state.observation_noise.covariances(event) @ here[:3, :3].T
@@ -404,8 +390,3 @@ def are_one(
             shifts.append(own[rows] - others[other_rows])
     distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
     return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)
-
-
-def _shown(event: ObservationEvent) -> FloatArray:
-    """Return the points (m, 3) as the sensor showed them, whatever a hypothesis makes of that."""
-    return event.points if event.sensed is None else event.sensed.arms

@@ -9,7 +9,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, field
 import math
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -234,10 +234,6 @@ class Visibility:
         return is_unexpected
 
 
-Verdicts: TypeAlias = dict[int, tuple[FloatArray, bool]]
-"""By id, where suspects were (3,) when they were seen last, and whether they were believed."""
-
-
 @dataclass(slots=True, eq=False)
 class Hypothesis:
     """A state, with the helpers for points without an id."""
@@ -246,7 +242,6 @@ class Hypothesis:
     visibility: Visibility  # the view of a sensor that gives no ids
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
     cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
-    verdicts: Verdicts = field(default_factory=dict)
 
     @classmethod
     def of(cls, state: State) -> Hypothesis:
@@ -255,9 +250,7 @@ class Hypothesis:
 
     def with_state(self, state: State) -> Hypothesis:
         """Return another hypothesis, which has had the same landmarks in view."""
-        return Hypothesis(
-            state, self.visibility.copy(), copy(self.index), self.cost, self.verdicts
-        )
+        return Hypothesis(state, self.visibility.copy(), copy(self.index), self.cost)
 
     def copy(self) -> Hypothesis:
         """Return an independent copy."""

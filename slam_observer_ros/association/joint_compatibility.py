@@ -35,9 +35,8 @@ A search in depth would spend its time below the first pair, and never see that 
 """
 
 PRUNING_COST, PRUNING_COST_OF_IDS = 16.0, 35.0
-"""How much more than the cheapest something may cost: at odds of e^8 it is given up. Where all
-points have ids, at odds of e^17.5: that one of them is wrong, or that wheels have slipped, costs
-what it is set to cost, and few points say which.
+"""How much more than the cheapest something may cost: at odds of e^8 it is given up. Where points
+have ids, at odds of e^17.5: a slip costs what it is set to cost, and few points speak for it.
 """
 
 RESOLUTION = 2.0
@@ -212,7 +211,7 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
 def pruning_cost(ids: IntArray) -> float:
     """Return how much more than the cheapest an interpretation of points (m,) may cost.
 
-    More where some have an id, which may be wrong: what speaks against it comes later.
+    More where some have an id, as slips are weighed then: what speaks for one comes later.
     """
     return PRUNING_COST if (ids == UNKNOWN_ID).all() else PRUNING_COST_OF_IDS
 

@@ -26,7 +26,6 @@ static const double MAX_ERROR_M = 1e3;
 static const double MIN_SHARE = 1e-6, MOST_SHARE_M2 = 1e-6;
 static const double MIN_INTERVAL_S = 1e-3;
 static const double LOST = 1e-7;             /* matrices.py */
-static const double SUSPICION = 3.0;         /* robust.py */
 static const double LOG_ROOT_2_PI = 0.9189385332046728;
 static const int REWEIGHTINGS = 2;
 static const i64 LATEST_NS = (i64)1 << 61;   /* stamps beyond it are unusual: no sum overflows */
@@ -211,10 +210,10 @@ static const char *const POINT_FIGURES[] = {"f", "f", "f", "f", "f", NULL};
 
 typedef struct {
     double gate, huber, error_time_s;
-    i64 confirmations, max_rejections, weighs_meanings;
+    i64 confirmations, max_rejections;
 } Limits;
 
-static const char *const LIMITS[] = {"f", "f", "f", "i", "i", "b", NULL};
+static const char *const LIMITS[] = {"f", "f", "f", "i", "i", NULL};
 
 typedef struct {
     const double *shares;
@@ -899,30 +898,6 @@ static void fill_predicted(const Estimate *x, const Observed *out, Residuals *re
     }
 }
 
-/* Whether what the others leave of residual i, ((S^-1)_ii)^-1 (S^-1 r)_i, is far off; -1 if S is
- * indefinite. ``work``: M k. */
-static int is_far_from_the_others(const Residuals *res, long i, double gate, double *work) {
-    int k = res->k;
-    double information[9] = {0.0}, left[3];
-    for (int b = 0; b < k; b++) { /* columns of L^-1 */
-        double *column = work + b * res->M;
-        memset(column, 0, (size_t)res->M * sizeof(double));
-        column[k * i + b] = 1.0;
-        solve_lower(res->L, res->M, column);
-        left[b] = res->S_inv_r[k * i + b];
-    }
-    for (int b = 0; b < k; b++)
-        for (int t = 0; t < k; t++)
-            for (long l = 0; l < res->M; l++)
-                information[k * b + t] += work[b * res->M + l] * work[t * res->M + l];
-    if (!factor(information, k))
-        return -1;
-    solve_lower(information, k, left);
-    solve_upper(information, k, left);
-    double square = squared_distance(left, res->R + k * k * i, k);
-    return square < 0.0 ? -1 : sqrt(square) > SUSPICION * gate;
-}
-
 /* How far off each residual was, its density given those before it, shares; then all together. */
 static void write_judged(const Residuals *res, double *judged) {
     long m = res->m, M = res->M;
@@ -939,8 +914,8 @@ static void write_judged(const Residuals *res, double *judged) {
     judged[3 * m] = sum_of_squares(res->z, M);
 }
 
-/* S = C P C' + R, factored; UNUSUAL where that fails, or a point may be something else, REJECTS
- * where the weights say which ones are rejected. */
+/* S = C P C' + R, factored; UNUSUAL where that fails, REJECTS where the weights say which points
+ * are rejected. */
 static int judge(const Estimate *x, const Limits *limits, const Observed *out, Residuals *res) {
     long M = res->M;
     int k = res->k, status = DONE;
@@ -964,12 +939,6 @@ static int judge(const Estimate *x, const Limits *limits, const Observed *out, R
             out->weights[i] = square >= 0.0 && sqrt(square) <= gate;
             status = out->weights[i] == 0.0 ? REJECTS : status;
         }
-    for (long i = 0; i < res->m && limits->weighs_meanings && status == DONE; i++) {
-        double square = squared_distance(res->r + k * i, res->R + k * k * i, k);
-        if (square < 0.0
-            || (sqrt(square) > SUSPICION * gate && is_far_from_the_others(res, i, gate, res->W)))
-            status = UNUSUAL;
-    }
     return status;
 }
 

@@ -78,7 +78,6 @@ class Limits(NamedTuple):
     error_time_s: float  # correlation time of the errors of points
     confirmations: int  # observations that make a landmark sure
     max_rejections: int  # in a row, which make it doubtful
-    weighs_meanings: bool  # whether a point that its id explains badly may be something else
 
 
 class Observed(NamedTuple):

@@ -2,7 +2,7 @@
 
 The usual step has both once more (observer/step.py and observer/_core.c); in smoothing, a weight
 that falls off takes the gate's place (smoothing/observations.py). Where the state is uncertain
-the gate is wide, and outliers pass it; see :func:`far_from_the_others`.
+the gate is wide, and outliers pass it.
 
 Residuals r are (m, k), metres; ``predicted`` (m k, m k) is their covariance C P Cᵀ without the
 ``noise`` (m, k, k) of the observations, m².
@@ -14,11 +14,9 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry.matrices import (
-    definite_inverse,
     diagonal_blocks,
     mahalanobis,
     solve_definite,
-    solve_symmetric,
     with_blocks,
 )
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -28,11 +26,6 @@ AT_ONCE = 32
 
 REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
-
-SUSPICION = 3.0
-"""How many times the gate an observation must be off, by the sensor's noise alone, to be suspect.
-One that is off by less can't throw the pose far.
-"""
 
 
 def observation_weights(
@@ -67,26 +60,6 @@ def observation_weights(
 def accepted(distances: FloatArray, gate: float) -> BoolArray:
     """Return which residuals pass the gate, by their Mahalanobis distances."""
     return distances <= gate
-
-
-def are_far(sensor_distances: FloatArray, gate: float) -> BoolArray:
-    """Return which residuals are suspect by their distances (m,) in the sensor's noise alone."""
-    return sensor_distances > SUSPICION * gate
-
-
-def far_from_the_others(
-    r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: float
-) -> BoolArray:
-    """Return which observations (m,) pass the gate, but are far off if all others are true."""
-    passed, predicted_passed = gated(r, predicted, noise, gate)
-    S = with_blocks(predicted_passed, noise[passed])
-    information = definite_inverse(S)
-    S_inv_r = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
-    blocks = diagonal_blocks(information, r.shape[1])
-    # The rest of the residual r_i, after all others: ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i.
-    left = solve_symmetric(blocks, S_inv_r)[:, :, 0]
-    passed[passed] = are_far(mahalanobis(left, noise[passed]), gate)
-    return passed
 
 
 def gated(

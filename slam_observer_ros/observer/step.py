@@ -44,8 +44,6 @@ from slam_observer_ros.observer.flat_arrays import (
 )
 from slam_observer_ros.observer.robust import (
     accepted,
-    are_far,
-    far_from_the_others,
     huber_weights,
     REWEIGHTINGS,
 )
@@ -283,8 +281,6 @@ def observe(
         out.weights[:] = accepted(judged.distances, limits.gate)
         _take_over(factors, learnt)
         return REJECTS
-    if limits.weighs_meanings and _may_be_something_else(residuals, judged, limits.gate):
-        return UNUSUAL
     weights = _weights(residuals, judged, limits)
     dx = None if weights is None else _correct(x, residuals, weights)
     if weights is None or dx is None:
@@ -404,13 +400,6 @@ def _judged(x: Estimate, residuals: _Residuals, limits: Limits) -> _Judged | Non
     if residuals.flat.dot(S_inv_r) > limits.gate**2:
         distances = mahalanobis(residuals.r[:, : axes.point], diagonal_blocks(S, axes.point))
     return _Judged(predicted, S, L, S_inv_r, distances)
-
-
-def _may_be_something_else(residuals: _Residuals, judged: _Judged, gate: float) -> bool:
-    """Return whether some point is only so near to its landmark as the state is uncertain."""
-    R, r = residuals.R, residuals.r[:, : residuals.axes.point]
-    far = are_far(mahalanobis(r, R), gate)
-    return bool(far.any() and (far & far_from_the_others(r, judged.predicted, R, gate)).any())
 
 
 def _learnt(

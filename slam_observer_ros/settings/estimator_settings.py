@@ -439,9 +439,9 @@ class Settings:
     )
     max_hypotheses: int = parameter(
         8,
-        'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
-        'have slipped: most hypotheses that are followed until it is clear which one is right; '
-        'where points have no id, no more than two',
+        'Riccati gains, points without id, or a robot that may have slipped: most hypotheses that '
+        'are followed until it is clear which one is right; where points have no id, no more than '
+        'two',
         minimum=1,
         maximum=1000,
     )

@@ -25,7 +25,6 @@ from slam_observer_ros.state.matching import (
     keyframe_of,
     mapped,
     MatchedObservation,
-    positions,
     reject,
     residuals_of,
     sensitivity,
@@ -134,18 +133,6 @@ def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> No
         return
     used = state.landmarks.rejections[rows] == 0
     state.observer.set_landmark_velocities(rows[used], velocities[used])
-
-
-def disbelieve(state: State, event: ObservationEvent) -> None:
-    """Count points as rejected although the gate lets them pass.
-
-    Landmarks that become doubtful by that are forgotten, and are new when they are seen next.
-    """
-    event, rows = mapped(state, event)  # one may have made room
-    state.landmarks.reject(rows, *positions(state, event))
-    in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
-    if in_doubt.any():
-        state.remove(rows[in_doubt])
 
 
 def _rows_to_forget(state: State, matched: MatchedObservation) -> IntArray:

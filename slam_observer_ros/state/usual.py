@@ -221,7 +221,6 @@ def _limits(settings: Settings, error_time_s: float) -> Limits:
         error_time_s=error_time_s,
         confirmations=settings.confirmations,
         max_rejections=settings.max_rejections,
-        weighs_meanings=settings.max_hypotheses > 1,
     )
 
 

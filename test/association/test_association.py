@@ -369,24 +369,6 @@ def test_ids_name_the_landmarks_of_a_fixed_map_that_has_none():
     assert estimator.counts['unmapped_landmark'] == 1
 
 
-@pytest.mark.parametrize('far_m', [1.0, 2.0])
-def test_the_one_landmark_in_view_is_doubted_once_not_at_each_look(far_m):
-    """After a blind drive it only passes the gate as the state is uncertain."""
-    estimator, rng = Estimator(PLANAR), np.random.default_rng(0)
-    followed = []
-    for step in range(832):
-        is_blind = 20 <= step < 820
-        turn = 0.3 if step < 120 else -0.3
-        stand(estimator, 0.1 * step, (0, 0, turn * is_blind, np.sign(turn) * 0.5 * is_blind, 0, 0))
-        if not is_blind:
-            noise_m = 0.01 * np.append(rng.standard_normal(2), 0.0)
-            off_m = far_m * (step >= 820) * np.array([0.5, 0.4, 0.0])
-            observe(estimator, 0.1 * step, [[3.0, 0.5, 0.0] + off_m + noise_m], [1])
-            followed.append(len(estimator._hypotheses))
-    assert max(followed) in {2, 3}
-    assert followed[-1] == 1
-
-
 @pytest.mark.parametrize('seed', range(30))
 def test_many_points_seen_after_a_blind_stretch_are_distinguished_together(seed):
     """Each of them alone could be any landmark within metres."""

@@ -13,6 +13,7 @@ from slam_observer_ros.association.slip import slip
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.matching import match
 
@@ -144,6 +145,54 @@ def test_a_landmark_without_id_keeps_no_robot_from_being_found_again(seed):
     pose = moved @ world.true_pose(world.events[-1].stamp_ns)
     assert estimator.counts['slip'] == 1
     assert np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]) < 0.1
+
+
+ELSEWHERE = LandmarkMap(
+    np.array([91, 92]), np.array([[100.0, 0.0, 0.0], [105.0, 0.0, 0.0]]), None, np.array([9, 9])
+)
+
+
+def carried_and(do_then):
+    """Run a world in which the robot is carried, and do something as soon as that is weighed.
+
+    Returns how far the position is off at the end, and the estimator.
+    """
+    world, moved = carried(PLANAR, 0)
+    estimator, is_done = Estimator(PLANAR), False
+    for event in world.events:
+        assert estimator.add(event)
+        if len(estimator._hypotheses) > 1 and not is_done:
+            is_done = True
+            do_then(estimator)
+    assert is_done
+    pose = moved @ world.true_pose(world.events[-1].stamp_ns)
+    return np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]), estimator
+
+
+@pytest.mark.parametrize(
+    'do_then',
+    [
+        lambda estimator: estimator.change_settings(replace(estimator.settings, gain_k=2.0)),
+        lambda estimator: estimator.forget(77),
+        lambda estimator: estimator.load_map(ELSEWHERE),
+    ],
+    ids=['change_settings', 'forget', 'load_map'],
+)
+def test_what_says_nothing_of_the_pose_leaves_open_which_state_is_right(do_then):
+    error_m, estimator = carried_and(do_then)
+    assert error_m < 0.3
+    assert estimator.counts['slip'] >= 1
+
+
+def test_a_landmark_is_forgotten_in_all_states_that_are_followed():
+    def forget(estimator):
+        nearest = estimator.landmark_ids[0]
+        assert estimator.forget(nearest)
+        for hypothesis in estimator._hypotheses._all:
+            assert nearest not in hypothesis.state.landmarks.ids
+
+    error_m, _ = carried_and(forget)
+    assert error_m < 0.3
 
 
 def without_ids(_, event):

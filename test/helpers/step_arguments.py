@@ -117,7 +117,7 @@ def random_observation(rng):
         c_v,
     )
     huber, error_time_s = float(rng.choice([0.0, 1.345])), float(rng.choice([0.0, 0.5]))
-    limits = Limits(6.0, huber, error_time_s, 3, 4, bool(rng.integers(2)))
+    limits = Limits(6.0, huber, error_time_s, 3, 4)
     factors = None
     if rng.integers(2):
         shares = np.array([random_covariance(rng, p, 0.02) for _ in range(2)])

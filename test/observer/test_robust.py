@@ -14,9 +14,7 @@ from strategies import generators
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.robust import (
-    far_from_the_others,
     huber_weights,
     observation_weights,
 )
@@ -88,34 +86,14 @@ def test_each_observation_is_gated_by_its_own_distance(rng, scale, k):
     np.testing.assert_array_equal(weights == 0.0, distances > 6.0)
 
 
-@given(generators(), st.floats(0.0, 1e3), st.floats(0.0, 300.0), st.sampled_from([2, 3]))
-def test_far_from_the_others_is_judged_by_what_these_predict(rng, spread, scale, k):
-    r, predicted, noise = random_problem(rng, k=k)
-    r, predicted = scale * r, spread * predicted
-    S = predicted + block_diagonal(noise)
-    own = np.einsum('ijik->ijk', S.reshape(len(r), k, len(r), k))
-    passed = np.flatnonzero(mahalanobis(r, own) <= 6.0)
-    expected = np.zeros(len(r), dtype=bool)
-    for i in passed:
-        one = k * i + np.arange(k)
-        others = (k * passed[passed != i][:, None] + np.arange(k)).ravel()
-        expected_r = S[np.ix_(one, others)] @ np.linalg.solve(
-            S[np.ix_(others, others)], r.ravel()[others]
-        )
-        left = (r[i] - expected_r)[None]
-        expected[i] = mahalanobis(left, noise[[i]])[0] > 3.0 * 6.0
-    found = far_from_the_others(r, predicted, noise, 6.0)
-    np.testing.assert_array_equal(found, expected)
-
-
 POSTS = np.array([[2.0, 1.0, 0.0], [2.0, -1.0, 0.0], [6.0, 3.0, 0.0], [6.0, -4.0, 0.0]])
 
 
-def drive_on_blindly(settings, wrong, do_then=None, is_stray_seen=False):
+def drive_on_blindly(settings, wrong, is_stray_seen=False):
     """Look at posts 0 and 1; go 4 m in 8 s without odometry; look at 2 and 3, then all around.
 
-    Right after the blind stretch posts (the keys) are named as ``wrong`` has it, and ``do_then``
-    is done to the estimator. Returns how far the pose is off after each look.
+    Right after the blind stretch posts (the keys) are named as ``wrong`` has it. Returns how far
+    the pose is off after each look.
     """
     estimator, errors_m = Estimator(replace(settings, unknown_linear_motion=1.0)), []
     for step in range(41):
@@ -129,23 +107,30 @@ def drive_on_blindly(settings, wrong, do_then=None, is_stray_seen=False):
         assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         assert estimator.add(ObservationEvent(stamp_ns, ids, points))
         estimator.flush()
-        if step == 10 and do_then:
-            do_then(estimator)
         errors_m.append(np.linalg.norm(estimator.pose[:3, 3] - ahead_m))
     return errors_m, estimator
 
 
 @modes
-@pytest.mark.parametrize('wrong', [{2: 0}, {2: 0, 3: 1}, {2: 1, 3: 0}], ids=str)
+@pytest.mark.parametrize('wrong', [{2: 0, 3: 1}, {2: 1, 3: 0}], ids=str)
 @pytest.mark.parametrize('is_stray_seen', [False, True])
-def test_wrong_ids_after_a_blind_stretch_do_not_throw_the_pose(two_d_mode, wrong, is_stray_seen):
+def test_wrong_ids_after_a_blind_stretch_are_put_right_by_right_ones(
+    two_d_mode, wrong, is_stray_seen
+):
     """Seen once, they look like a loop closed; where the robot really is, others show later."""
     settings = Settings(two_d_mode=two_d_mode)
-    errors_m, estimator = drive_on_blindly(settings, wrong, is_stray_seen=is_stray_seen)
+    errors_m, estimator = drive_on_blindly(settings, wrong, is_stray_seen)
     assert errors_m[10] > 1.0  # an id is believed until something speaks against it
     assert max(errors_m[-5:]) < 0.2
-    assert estimator.counts['rejected_landmark'] == len(wrong)
+    assert estimator.counts['rejected_landmark'] > 0
     assert estimator.counts['moved_landmark'] == 0
+
+
+@modes
+def test_a_wrong_id_that_alone_closes_a_loop_is_believed(two_d_mode):
+    """Nothing speaks against it before other landmarks are mapped from there."""
+    errors_m, _ = drive_on_blindly(Settings(two_d_mode=two_d_mode), {2: 0})
+    assert min(errors_m[10:]) > 1.0
 
 
 @modes
@@ -160,85 +145,7 @@ def test_a_wrong_id_among_right_ones_after_a_blind_stretch_does_not_throw_the_po
         assert estimator.add(ObservationEvent(stamp_ns, np.array([*named.values()]), points))
     estimator.flush()
     assert np.linalg.norm(estimator.pose[:3, 3] - ahead_m) < 0.2
-    assert estimator.counts['rejected_landmark'] == 1
-
-
-@modes
-@pytest.mark.parametrize('off_m', [[0.0, -6.0, 0.0], [-3.0, -6.0, 0.0], [3.0, -4.0, 0.0]], ids=str)
-def test_a_landmark_that_one_wrong_id_has_placed_does_not_throw_the_pose_for_good(
-    two_d_mode, off_m
-):
-    """It is what is seen first after a blind stretch; later the others show where the robot is."""
-    estimator = Estimator(Settings(two_d_mode=two_d_mode, unknown_linear_motion=1.0))
-    for step in range(60):
-        stamp_ns = (100 + step) * 100_000_000 + (step >= 10) * 8_000_000_000
-        ahead_m = np.array([4.0 * (step >= 10), 0.0, 0.0])
-        ids = np.array([0, 1] if step < 10 else [2, 3] if step < 35 else [0, 1, 2, 3])
-        points = POSTS[ids] - ahead_m
-        if step == 5:
-            ids, points = np.append(ids, 2), np.vstack([points, POSTS[2] + off_m])
-        assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
-        assert estimator.add(ObservationEvent(stamp_ns, ids, points))
-    estimator.flush()
-    assert np.linalg.norm(estimator.pose[:3, 3] - ahead_m) < 0.1
-    order = np.argsort(estimator.landmark_ids)
-    np.testing.assert_allclose(estimator.world_points[order], POSTS, atol=0.1)
     assert estimator.counts['moved_landmark'] == 0
-
-
-def test_a_landmark_that_is_disbelieved_may_have_made_room_for_a_new_one():
-    settings = Settings(two_d_mode=True, unknown_linear_motion=1.0, max_landmarks=3)
-    estimator = Estimator(settings)
-    for step in range(16):
-        stamp_ns = (100 + step) * 100_000_000 + (step >= 10) * 8_000_000_000
-        ahead_m = np.array([4.0 * (step >= 10), 0.0, 0.0])
-        ids = np.array([0, 1] if step < 10 else [2, 3])
-        points = POSTS[ids] - ahead_m
-        if step == 5:
-            ids, points = np.append(ids, 2), np.vstack([points, POSTS[2] - [0.0, 6.0, 0.0]])
-        assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
-        assert estimator.add(ObservationEvent(stamp_ns, ids, points))
-    estimator.flush()
-    for hypothesis in estimator._hypotheses._all:
-        landmarks = hypothesis.state.landmarks
-        assert len(landmarks) <= 3
-        assert np.all(landmarks.rejections[landmarks.ids == 3] == 0)
-
-
-def test_with_a_single_hypothesis_a_wrong_id_is_believed_for_good():
-    errors_m, _ = drive_on_blindly(Settings(two_d_mode=True, max_hypotheses=1), {2: 0})
-    assert min(errors_m[10:]) > 1.0
-
-
-ELSEWHERE = LandmarkMap(
-    np.array([91, 92]), np.array([[100.0, 0.0, 0.0], [105.0, 0.0, 0.0]]), None, np.array([9, 9])
-)
-
-
-@pytest.mark.parametrize(
-    'do_then',
-    [
-        lambda estimator: estimator.change_settings(replace(estimator.settings, gain_k=2.0)),
-        lambda estimator: estimator.forget(77),
-        lambda estimator: estimator.load_map(ELSEWHERE),
-    ],
-    ids=['change_settings', 'forget', 'load_map'],
-)
-def test_what_says_nothing_of_the_pose_leaves_open_which_state_is_right(do_then):
-    errors_m, estimator = drive_on_blindly(Settings(two_d_mode=True), {2: 0}, do_then)
-    assert max(errors_m[-5:]) < 0.2
-    assert estimator.landmark_ids.tolist() == [0, 1, 2, 3]
-
-
-def test_a_landmark_is_forgotten_in_all_states_that_are_followed():
-    def forget(estimator):
-        assert len(estimator._hypotheses) == 2
-        assert estimator.forget(1)
-
-    _, estimator = drive_on_blindly(Settings(two_d_mode=True), {2: 0}, forget)
-    seen_since = len(estimator.landmark_counts) - 1  # 1 is new, and the last in the map
-    assert estimator.landmark_ids[seen_since] == 1
-    assert estimator.landmark_counts[seen_since] == 10
 
 
 def test_a_rejected_observation_says_nothing_of_how_its_landmark_moves():
