@@ -43,10 +43,10 @@ class _Metadata(NamedTuple):
 
 
 def open_source(path: Path) -> tuple[MessageSource, str | None]:
-    """Open a .mcap, .db3 or .bag file or a rosbag2 directory, damaged or not.
+    """Open a .mcap, .db3 or .bag file or a rosbag2 directory.
 
-    Also returns a warning, if only a part of it could be read. Raises a RecordingError that says
-    in one line what to do if there is nothing to read.
+    Also returns a warning, if only a part of it could be read, as of a damaged MCAP file. Raises
+    a RecordingError that says in one line what to do if there is nothing to read.
     """
     try:
         not_special(path)
@@ -194,23 +194,9 @@ def _open_mcap(path: Path) -> tuple[MessageSource, str | None]:
 
 
 def _open_bag(path: Path) -> tuple[MessageSource, str | None]:
-    # MCAP files do without these.
-    from slam_observer_ros.recording.bag_source import BagSource, MendedSource
+    from slam_observer_ros.recording.bag_source import BagSource  # MCAP files do without it
 
-    try:
-        return MendedSource(BagSource(path), lambda: _salvaged(path)), None
-    except RecordingError as error:
-        source = _salvaged(path)
-        if any(topic.count for topic in source.topics):
-            return source, _left_out(path, source)
-        raise RecordingError(f'{error}; {_NONE_LEFT}') from error
-
-
-def _salvaged(path: Path) -> MessageSource:
-    from slam_observer_ros.recording.bag_source import SalvagedSource
-    from slam_observer_ros.recording.salvage_formats import SCANS  # which few files need
-
-    return SalvagedSource(path, SCANS[path.suffix])
+    return BagSource(path), None
 
 
 def _left_out(path: Path, source: MessageSource) -> str | None:

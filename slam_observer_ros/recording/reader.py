@@ -73,8 +73,8 @@ class _Reading:
 class Recording:
     """An open MCAP file, rosbag2 (directory or bare .db3) or ROS 1 .bag: use it in ``with``.
 
-    Of a damaged one, what is whole is read. Raises a RecordingError that says in one line
-    what to do if there is nothing to read, also later if the file turns out to be damaged.
+    Of a damaged MCAP file, what is whole is read. Raises a RecordingError that says in one line
+    what to do if there is nothing to read, also later if another file turns out to be damaged.
 
     Attributes
     ----------

@@ -10,7 +10,7 @@ import heapq
 from itertools import groupby, islice
 from pathlib import Path
 import re
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,6 @@ from numpy.typing import NDArray
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.messages.cdr import Buffer
-
-if TYPE_CHECKING:
-    pass
-
 
 MOST_IN_BLOCK = 4096
 """Messages of a block at most."""
@@ -233,11 +229,19 @@ def in_blocks(messages: Iterator[RawMessage], together: Topic) -> Iterator[RawMe
             yield RawBlock(together, stamps_ns, data.reshape(len(some), size))
 
 
+MENDED_BY: Final = {
+    '.mcap': "'mcap recover'",
+    '.db3': "'sqlite3 OLD.db3 .recover | sqlite3 NEW.db3'",
+    '.bag': "'rosbag reindex'",
+}
+"""Programs of others that save the whole messages of a damaged file, by its suffix."""
+
+
 @contextmanager
 def damage_reported(path: Path, mends: bool = True) -> Iterator[None]:
-    """Turn whatever the reading libraries raise into one line about the file.
+    """Turn whatever the reading libraries raise into one line about the file, and its remedy.
 
-    ``mends`` is whether another program may mend a file that was opened.
+    ``mends`` is whether another program may mend the file.
 
     Fed with damaged files they pass on AssertionError, OverflowError, MemoryError, and the errors
     of their decompressors and of SQLite: no list of classes is complete.
@@ -250,5 +254,5 @@ def damage_reported(path: Path, mends: bool = True) -> Iterator[None]:
         reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
         if isinstance(error, UnicodeError):  # bytes where text should be
             reason = f'it is damaged, or no {path.suffix} file'
-        remedy = "; 'mcap recover' may save the rest" if mends and path.suffix == '.mcap' else ''
+        remedy = f'; mend it by {MENDED_BY[path.suffix]}' if mends else ''
         raise RecordingError(f'{path}: can not be read: {reason}{remedy}') from error

@@ -19,7 +19,7 @@ from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.evaluation.trajectory import LandmarkTruth
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.poses import PoseBlock, PoseMessage
-from slam_observer_ros.recording.bag_source import BagSource
+from slam_observer_ros.recording.mcap_source import McapSource
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, other_frames
 from slam_observer_ros.recording.sources import SplitSource
@@ -318,7 +318,7 @@ def test_a_split_recording_lasts_from_the_start_of_the_first_file_to_the_end_of_
         with RecordingWriter(tmp_path / f'{index}.mcap') as writer:
             for count in range(3):
                 writer.write_velocity(VelocityEvent(10 * index + count, np.zeros(6)))
-    source = SplitSource([BagSource(tmp_path / f'{index}.mcap') for index in (1, 0)])
+    source = SplitSource([McapSource(tmp_path / f'{index}.mcap') for index in (1, 0)])
     assert (source.start_ns, source.end_ns) == (0, 12)
     received = [raw.receive_stamp_ns for raw in source.messages(source.topics)]
     assert received == [0, 1, 2, 10, 11, 12]
@@ -451,11 +451,19 @@ class TestCompression:
                 assert not run.loss
 
     @pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
-    def test_of_one_that_is_cut_off_what_is_there_is_read(self, tmp_path, storage, mode):
+    def test_of_one_that_is_cut_off_what_is_there_is_read_or_the_remedy_named(
+        self, tmp_path, storage, mode
+    ):
         repeats = 200 if storage == StoragePlugin.MCAP else 50  # chunks are large
         directory = recordings.write_rosbag2(tmp_path / 'run', storage, mode, repeats=repeats)
         (file,) = (path for path in directory.iterdir() if path.suffix != '.yaml')
         os.truncate(file, file.stat().st_size * 2 // 3)
+        if storage == StoragePlugin.SQLITE3:
+            with pytest.raises(RecordingError, match='mend it by') as caught:
+                Recording(directory)
+            assert str(file) in str(caught.value)
+            assert 'slam_observer_' not in str(caught.value)
+            return
         with Recording(directory) as run:
             assert 0 < len(list(run.events(run.find_topics()))) < repeats * 150
             assert run.loss

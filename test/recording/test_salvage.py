@@ -1,4 +1,4 @@
-"""Of a damaged recording what is whole is read, and how much is lost is said."""
+"""Of a damaged MCAP file the whole messages are read; others are refused with what mends them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.recording.bag_source import SalvagedSource
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.salvage_formats import SCANS
+from slam_observer_ros.recording.sources import MENDED_BY
 from slam_observer_ros.recording.writer import RecordingWriter
 
 COUNT = 30_000  # of MCAP, whose chunks are large
@@ -117,22 +116,6 @@ def test_of_a_whole_recording_nothing_is_lost(whole, name):
     assert (len(velocities), bool(loss), warning) == (COUNTS[name], False, None)
 
 
-@pytest.mark.parametrize('name', ['db3', 'bag'])
-def test_of_a_whole_recording_a_scan_finds_the_same(whole, name):
-    scanned = SalvagedSource(whole[name], SCANS[f'.{name}'])
-    with Recording(whole[name]) as recording:
-        assert set(scanned.topics) == set(recording.topics)
-        messages, found = (
-            sorted(
-                (raw.receive_stamp_ns, raw.topic.name, bytes(raw.data))
-                for raw in source.messages(source.topics)
-            )
-            for source in (recording._source, scanned)
-        )
-        assert messages == found
-    assert not scanned.loss
-
-
 def test_of_a_split_recording_what_is_whole_before_and_behind_a_damaged_chunk_is_read(
     whole, tmp_path
 ):
@@ -151,49 +134,97 @@ def test_of_a_split_recording_what_is_whole_before_and_behind_a_damaged_chunk_is
     assert loss.byte_count > 0
 
 
-@pytest.mark.parametrize('name', FORMATS)
-def test_a_recording_that_is_cut_off_is_read_up_to_there(whole, tmp_path, name):
-    data = whole[name].read_bytes()
-    path = tmp_path / whole[name].name
-    path.write_bytes(data[: len(data) * 2 // 3])
+def cut_off(data: bytes) -> bytes:
+    return data[: len(data) * 2 // 3]
+
+
+def blanked(data: bytes) -> bytes:
+    """Return it with zeros in the middle."""
+    middle = len(data) // 2
+    return data[:middle] + bytes(20_000) + data[middle + 20_000 :]
+
+
+def test_a_recording_that_is_cut_off_is_read_up_to_there(whole, tmp_path):
+    path = tmp_path / 'run.mcap'
+    path.write_bytes(cut_off(whole['mcap'].read_bytes()))
     velocities, loss, warning = read(path)
-    assert COUNTS[name] // 3 < len(velocities) < COUNTS[name]
+    assert COUNT // 3 < len(velocities) < COUNT
     assert velocities == sorted(velocities)
     assert loss.is_cut_off
     assert 'cut off or damaged' in warning
     assert f'{loss.byte_count} bytes' in warning
 
 
-@pytest.mark.parametrize('name', FORMATS)
-def test_behind_damage_in_the_middle_it_goes_on_with_what_is_whole(whole, tmp_path, name):
-    data = bytearray(whole[name].read_bytes())
-    path = tmp_path / whole[name].name
-    middle = len(data) // 2
-    data[middle : middle + 20_000] = bytes(20_000)
+def test_behind_damage_in_the_middle_it_goes_on_with_what_is_whole(whole, tmp_path):
+    data = blanked(whole['mcap'].read_bytes())
+    path = tmp_path / 'run.mcap'
     path.write_bytes(data)
     velocities, loss, _ = read(path)
-    assert COUNTS[name] // 2 < len(velocities) < COUNTS[name]
-    assert velocities[-1] == (COUNTS[name] - 1) * STEP_NS
+    assert COUNT // 2 < len(velocities) < COUNT
+    assert velocities[-1] == (COUNT - 1) * STEP_NS
     assert 10_000 < loss.byte_count < len(data) // 2
     assert loss.seconds == pytest.approx(np.diff(velocities).max() * 1e-9, abs=0.01)
     assert not loss.is_cut_off
 
 
 @pytest.mark.parametrize('name', FORMATS)
-def test_scripts_see_what_is_lost(slam_observer, whole, tmp_path, name):
-    options = ['--strict', '--json', '--gains', 'constant']
-    intact = slam_observer('replay', whole[name], *options)
-    assert intact.code == 0
-    assert not any(intact.json['lost'].values())
-    path = tmp_path / whole[name].name
-    data = bytearray(whole[name].read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 20_000] = bytes(20_000)
-    path.write_bytes(data)
-    ended = slam_observer('replay', path, *options)
+def test_scripts_see_that_nothing_is_lost(slam_observer, whole, name):
+    ended = slam_observer('replay', whole[name], '--strict', '--json', '--gains', 'constant')
+    assert ended.code == 0
+    assert not any(ended.json['lost'].values())
+
+
+def test_scripts_see_what_is_lost(slam_observer, whole, tmp_path):
+    path = tmp_path / 'run.mcap'
+    path.write_bytes(blanked(whole['mcap'].read_bytes()))
+    ended = slam_observer('replay', path, '--strict', '--json', '--gains', 'constant')
     assert ended.code == 3
     assert ended.json['lost']['bytes'] > 0
     assert 'a part of it was lost, which --strict does not allow' in ended.errors
     assert 'bytes and' in ended.errors
+
+
+@pytest.mark.parametrize('damaged', [cut_off, blanked])
+@pytest.mark.parametrize('name', ['db3', 'bag'])
+def test_a_damaged_file_of_another_format_is_refused_with_what_mends_it(
+    slam_observer, whole, tmp_path, name, damaged
+):
+    path, tum = tmp_path / f'run.{name}', tmp_path / 'run.tum'
+    path.write_bytes(damaged(whole[name].read_bytes()))
+    ended = slam_observer('replay', path, '--gains', 'constant', '--tum', tum)
+    assert (ended.code, ended.output) == (2, '')
+    error = ended.errors.splitlines()[-1]
+    assert f'{path}: can not be read: ' in error
+    assert f'; mend it by {MENDED_BY[path.suffix]}' in error
+    assert not tum.exists()
+
+
+@pytest.mark.parametrize('name', ['db3', 'bag'])
+@pytest.mark.parametrize(
+    ('content', 'why'), [(b'', 'it is empty'), (bytes(range(200)), 'it is damaged, or no .')]
+)
+def test_nothing_mends_a_file_that_is_of_no_format(tmp_path, name, content, why):
+    path = tmp_path / f'run.{name}'
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=why) as caught:
+        Recording(path)
+    assert 'mend it' not in str(caught.value)
+
+
+def test_of_a_split_recording_the_whole_databases_are_read_and_the_damaged_one_is_named(
+    whole, tmp_path
+):
+    (tmp_path / 'run_0.db3').write_bytes(whole['db3'].read_bytes())
+    (tmp_path / 'run_1.db3').write_bytes(cut_off(whole['db3'].read_bytes()))
+    metadata = METADATA.replace('mcap', 'sqlite3', 1).replace('.mcap', '.db3')
+    with Recording(whole['db3']) as recording:
+        topics = [(topic.name, topic.message_type) for topic in recording.topics]
+    (tmp_path / 'metadata.yaml').write_text(metadata + ''.join(TOPIC.format(*t) for t in topics))
+    velocities, loss, warning = read(tmp_path)
+    assert len(velocities) == FEWER
+    assert loss.byte_count == (tmp_path / 'run_1.db3').stat().st_size
+    assert f'{tmp_path / "run_1.db3"}: can not be read' in warning
+    assert f'mend it by {MENDED_BY[".db3"]}' in warning
 
 
 @pytest.mark.parametrize('name', FORMATS)
