@@ -27,6 +27,7 @@ from slam_observer_ros.events import (
     IMPOSSIBLE_ID,
     MAX_ID,
     ObservationEvent,
+    POINT,
     UNKNOWN_ID,
     VelocityBlock,
     VelocityEvent,
@@ -393,6 +394,10 @@ def usable_points(
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
     unknown = event.ids == UNKNOWN_ID
+    if event.kinds is not None and (halves := unknown & (event.kinds != POINT)).any():
+        warnings.warn('half_point_without_id', count=int(np.sum(halves)))
+        counts['unknown_id'] += int(np.sum(halves))
+        event, unknown = event.select(~halves), unknown[~halves]
     can_weigh = gains.errors is not None
     if not can_weigh and np.count_nonzero(unknown):
         warnings.warn('unknown_id', gains=settings.gains)
