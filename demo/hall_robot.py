@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,11 +24,28 @@ from slam_observer_ros.nodes.ros_interface import MESSAGES
 
 START_NS = 1_000_000_000  # a simulated /clock of zero means that there is no time yet
 ODOMETRY_HZ = 50
-ODOMETRY_PER_IMAGE = 5
 CAMERA_FRAME = 'camera_optical'
 
 DEEP_QOS = QoSProfile(depth=1000)
 STATIC_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@dataclass(frozen=True)
+class World:
+    """Where the robot drives, and what it sees there."""
+
+    kind: str  # of its landmarks
+    enough: int  # of these in view, by which the robot is found
+    params_file: str
+    landmarks: FloatArray  # (k, 4, 4) poses of tags, or (k, 3) points without ids, metres
+    has_orientations: bool  # whether the map says how tags are turned
+    true_pose: Callable[[float], FloatArray]  # (4, 4) of the base, by the time in seconds
+    lap_s: float
+    camera: FloatArray  # (4, 4) pose of the optical frame in the base, as /tf has it
+    steps_per_image: int
+    # What is seen at a pose (4, 4): of tags by ids, with their errors (k, 7); of points (m, 3).
+    sightings: Callable[[FloatArray, FloatArray, FloatArray], dict[int, FloatArray]] | None
+    scan: Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,12 +69,11 @@ class Estimated:
 
 
 class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
-    """Drives about the hall, a step of ``1 / ODOMETRY_HZ`` at a time.
-
-    It sees tags, or ``reflectors`` (n, 3) where there are any.
+    """Drives about in a world, a step of ``1 / ODOMETRY_HZ`` at a time.
 
     Attributes
     ----------
+    world : World
     seen : list of Seen
     estimated : list of Estimated
     corrections_s : list of float
@@ -64,15 +81,14 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
 
     """
 
-    def __init__(self, seed: int, reflectors: FloatArray | None) -> None:
+    def __init__(self, seed: int, world: World) -> None:
         super().__init__('hall_robot')
         self._random = np.random.default_rng(seed)
-        self._reflectors = reflectors
+        self.world = world
         self._carried_s = np.inf
         self._odometry = hall.WheelOdometry(self._random)
-        self._truth = hall.true_pose(0.0)
-        self._tag_poses = hall.tag_poses()
-        self._tag_errors = hall.TagErrors(self._random, len(self._tag_poses))
+        self._truth = world.true_pose(0.0)
+        self._tag_errors = hall.TagErrors(self._random, len(world.landmarks))
         self._steps = 0
         self._correction: FloatArray | None = None
         self.seen: list[Seen] = []
@@ -83,7 +99,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._cloud = self.create_publisher(PointCloud2, 'landmarks', DEEP_QOS)
         self._tf = self.create_publisher(TFMessage, '/tf', DEEP_QOS)
         static = self.create_publisher(TFMessage, '/tf_static', STATIC_QOS)
-        camera = MESSAGES.transform_stamped(START_NS, 'base_link', CAMERA_FRAME, hall.CAMERA)
+        camera = MESSAGES.transform_stamped(START_NS, 'base_link', CAMERA_FRAME, world.camera)
         static.publish(TFMessage(transforms=[camera]))
         self._static = static
         self.create_subscription(TFMessage, '/tf', self._hear_transforms, DEEP_QOS)
@@ -93,11 +109,6 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
     def time_s(self) -> float:
         """Simulated time since the start."""
         return self._steps / ODOMETRY_HZ
-
-    @property
-    def has_reflectors(self) -> bool:
-        """Whether it sees reflectors, and no tags."""
-        return self._reflectors is not None
 
     @property
     def is_heard(self) -> bool:
@@ -114,7 +125,8 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._truth = self._true_pose(self.time_s)
 
     def _true_pose(self, time_s: float) -> FloatArray:
-        return hall.true_pose(time_s + (0.5 * hall.LAP_S if time_s >= self._carried_s else 0.0))
+        ahead_s = 0.5 * self.world.lap_s if time_s >= self._carried_s else 0.0
+        return self.world.true_pose(time_s + ahead_s)
 
     def step(self) -> None:
         """Move on, and publish what is measured."""
@@ -124,12 +136,8 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         stamp_ns = START_NS + to_ns(self.time_s)
         self._clock_publisher.publish(Clock(clock=MESSAGES.time(stamp_ns)))
         self._publish_odometry(stamp_ns)
-        if self._steps % ODOMETRY_PER_IMAGE == 0:
-            count = (
-                self._publish_tags(stamp_ns)
-                if self._reflectors is None
-                else self._publish_scan(stamp_ns, self._reflectors)
-            )
+        if self._steps % self.world.steps_per_image == 0:
+            count = self._publish_tags(stamp_ns) + self._publish_scan(stamp_ns)
             by_tf = None if self._correction is None else self._correction @ self._odometry.pose
             self.seen.append(Seen(self.time_s, self._truth, by_tf, count))
 
@@ -143,15 +151,20 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         transform = MESSAGES.transform_stamped(stamp_ns, 'odom', 'base_link', odometry.pose)
         self._tf.publish(TFMessage(transforms=[transform]))
 
-    def _publish_scan(self, stamp_ns: int, reflectors: FloatArray) -> int:
-        points = hall.scan(self._truth, reflectors, self._random)
+    def _publish_scan(self, stamp_ns: int) -> int:
+        if self.world.scan is None:
+            return 0
+        points = self.world.scan(self._truth, self.world.landmarks, self._random)
         ids = np.full(len(points), UNKNOWN_ID)
         self._cloud.publish(MESSAGES.point_cloud2(stamp_ns, 'base_link', ids, points))
         return len(points)
 
     def _publish_tags(self, stamp_ns: int) -> int:
-        self._tag_errors.go_on(ODOMETRY_PER_IMAGE / ODOMETRY_HZ)
-        tags = hall.sightings(self._truth, self._tag_poses, self._tag_errors.values)
+        if self.world.sightings is None:
+            return 0
+        self._tag_errors.go_on(self.world.steps_per_image / ODOMETRY_HZ)
+        errors = self._tag_errors.values
+        tags = self.world.sightings(self._truth, self.world.landmarks, errors)
         transforms = [
             MESSAGES.transform_stamped(stamp_ns, CAMERA_FRAME, f'tag36h11:{tag_id}', pose)
             for tag_id, pose in tags.items()

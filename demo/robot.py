@@ -1,7 +1,8 @@
-"""``make robot``: a simulated robot is localised among tags, or reflectors, as for Nav2.
+"""``make robot``: a simulated robot is localised among tags, reflectors or codes, as for Nav2.
 
-It drives about a hall with AprilTags on its walls: lost at first, its localisation restarted in
-the middle, or the robot itself carried elsewhere. Over DDS, the observer is started as
+It drives about a hall with AprilTags on its walls, or reflectors in it, or over codes on its
+floor: lost at first, its localisation restarted in the middle, or the robot itself carried
+elsewhere. Over DDS, the observer is started as
 ``localization.launch.py`` does it.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
+from dataclasses import replace
 import os
 from pathlib import Path
 import subprocess
@@ -18,8 +20,9 @@ import tempfile
 import threading
 import time
 
+import floor
 import hall
-from hall_robot import HallRobot, ODOMETRY_HZ
+from hall_robot import HallRobot, ODOMETRY_HZ, World
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -30,20 +33,20 @@ from robot_report import Interruption, report
 
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.common.process import StopSignal
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.nodes.launch_setup import command_line, EXECUTABLE
 from slam_observer_ros.settings.estimator_settings import Settings
 
-PARAMS_FILE, PARAMS_OF_REFLECTORS = 'config/tags_on_tf.yaml', 'config/reflectors.yaml'
+PARAMS_FILE = 'config/tags_on_tf.yaml'
 LAUNCH_ARGUMENTS = {'map_file': 'hall.yaml', 'twist': 'odom', 'use_sim_time': 'true'}
 """Arguments of the launch file, beside ``params_file``."""
 
 RATE_HZ = 20.0
 """Rate of map → odom that is asked for, in simulated time."""
 
-SURVEY_SIGMA_M = 0.01
+SURVEY_SIGMA_M, SURVEY_SIGMA_RAD = 0.01, 0.02
 START_LIMIT_S = 60.0
 DISCOVERY_S = 1.0
 STOP_LIMIT_S = 10.0
@@ -57,18 +60,20 @@ class RobotError(SlamObserverError):
 class Observer:
     """The process of the observer, which can be ended and started again."""
 
-    def __init__(self, folder: Path, options: argparse.Namespace) -> None:
+    def __init__(self, folder: Path, options: argparse.Namespace, world: World) -> None:
         self._log = folder / f'{EXECUTABLE}.log'
-        self._input = "PointCloud2 on '/landmarks'" if options.reflectors else "TFMessage on '/tf'"
-        params_file = PARAMS_OF_REFLECTORS if options.reflectors else PARAMS_FILE
+        is_on_tf = world.sightings is not None
+        self._input = "TFMessage on '/tf'" if is_on_tf else "PointCloud2 on '/landmarks'"
         arguments = LAUNCH_ARGUMENTS | {'map_file': str(folder / LAUNCH_ARGUMENTS['map_file'])}
         # The rate is one of wall time, in which the simulation is faster.
         more = ['-p', f'publish_rate:={RATE_HZ * options.real_time_factor}']
+        if is_on_tf:
+            more += ['-p', 'landmarks_type:=tf']
         if options.keep_pose:
             more += ['-p', f'pose_file:={folder / "pose.yaml"}']
         self._command = [
             *(sys.executable, '-m', 'slam_observer_ros.nodes.executables', EXECUTABLE),
-            *command_line(params_file, arguments),
+            *command_line(world.params_file, arguments),
             *more,
         ]
         self._process: subprocess.Popen[bytes] | None = None
@@ -128,10 +133,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--keep-pose', action='store_true', help='let the observer keep its pose over the restart'
     )
-    parser.add_argument(
+    landmarks = parser.add_mutually_exclusive_group()
+    landmarks.add_argument(
         '--reflectors',
         action='store_true',
         help=f'see reflectors without ids, {hall.REFLECTORS} in a large hall, in place of tags',
+    )
+    landmarks.add_argument(
+        '--floor-codes',
+        action='store_true',
+        help='see codes on the floor, one at a time, by a camera that looks down, in their place',
     )
     parser.add_argument(
         '--carried',
@@ -148,18 +159,15 @@ def _run(
     """Drive, restarting the observer half-way, or carrying the robot."""
     stop = StopSignal()
     stop.begin()
-    reflectors = None
-    if options.reflectors:
-        reflectors = hall.reflectors(np.random.default_rng(options.seed))
-    points = hall.tag_poses()[:, :3, 3] if reflectors is None else reflectors
-    write_map(folder / LAUNCH_ARGUMENTS['map_file'], _surveyed(points, options.seed), Settings())
+    world = _world(options)
+    write_map(folder / LAUNCH_ARGUMENTS['map_file'], _surveyed(world, options.seed), Settings())
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with ExitStack() as cleanup:
         cleanup.callback(rclpy.try_shutdown)
-        robot = HallRobot(options.seed, reflectors)
+        robot = HallRobot(options.seed, world)
         cleanup.callback(robot.destroy_node)
         cleanup.enter_context(_listening(robot))
-        observer = Observer(folder, options)
+        observer = Observer(folder, options, world)
         cleanup.callback(observer.end)
         observer.start()
         _wait_until_heard(robot, observer)
@@ -187,12 +195,61 @@ def _run(
     return robot, interruption
 
 
-def _surveyed(points: FloatArray, seed: int) -> LandmarkMap:
-    """Return landmarks (n, 3) as somebody has measured them with a tape."""
-    off = np.random.default_rng(seed + 1).normal(0.0, SURVEY_SIGMA_M, points.shape)
-    count = len(points)
+def _world(options: argparse.Namespace) -> World:
+    """Return the world that the options name."""
+    random = np.random.default_rng(options.seed)
+    tags = World(
+        kind='tags',
+        enough=2,
+        params_file=PARAMS_FILE,
+        landmarks=hall.tag_poses(),
+        has_orientations=False,
+        true_pose=hall.true_pose,
+        lap_s=hall.LAP_S,
+        camera=hall.CAMERA,
+        steps_per_image=5,
+        sightings=hall.sightings,
+    )
+    if options.reflectors:
+        return replace(
+            tags,
+            kind='reflectors',
+            enough=6,
+            params_file='config/reflectors.yaml',
+            landmarks=hall.reflectors(random),
+            sightings=None,
+            scan=hall.scan,
+        )
+    if options.floor_codes:
+        return replace(
+            tags,
+            kind='code',
+            enough=1,
+            params_file='config/floor_codes.yaml',
+            landmarks=floor.code_poses(random),
+            has_orientations=True,
+            true_pose=floor.true_pose,
+            lap_s=floor.LAP_S,
+            camera=floor.CAMERA,
+            steps_per_image=2,
+            sightings=floor.sightings,
+        )
+    return tags
+
+
+def _surveyed(world: World, seed: int) -> LandmarkMap:
+    """Return the map of landmarks as somebody has measured them with a tape."""
+    random, count = np.random.default_rng(seed + 1), len(world.landmarks)
+    points = world.landmarks[:, :3, 3] if world.sightings else world.landmarks
+    points = points + random.normal(0.0, SURVEY_SIGMA_M, points.shape)
     covariances = np.tile(SURVEY_SIGMA_M**2 * np.eye(3), (count, 1, 1))
-    return LandmarkMap(np.arange(count), points + off, covariances, np.zeros(count, np.int64))
+    known = LandmarkMap(np.arange(count), points, covariances, np.zeros(count, np.int64))
+    if not world.has_orientations:
+        return known
+    off_rad = random.normal(0.0, SURVEY_SIGMA_RAD, (count, 3))
+    turned = np.array([so3.exp(off) for off in off_rad]) @ world.landmarks[:, :3, :3]
+    sigmas = np.full(count, SURVEY_SIGMA_RAD)
+    return replace(known, orientations=turned, orientation_sigmas=sigmas)
 
 
 def _wait_until_heard(robot: HallRobot, observer: Observer) -> None:

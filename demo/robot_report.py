@@ -11,7 +11,6 @@ from rich.console import Console
 from slam_observer_ros.cli.console import table_of
 from slam_observer_ros.common.types import FloatArray
 
-ENOUGH_TAGS, ENOUGH_REFLECTORS = 2, 6  # in view, by which the robot is found
 MAX_ERROR_M, MAX_ERROR_RAD = 0.15, 0.08  # of the RMS; with the noise of the hall it is a third
 MAX_BACK_S, MAX_NOTICED_S = 1.0, 10.0  # a robot that was carried has to notice that first
 FOUND_M = 0.5  # from there on it is where it was put
@@ -81,9 +80,7 @@ def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console
     if not located or not estimated:
         console.print('robot: it was never localised', style='red')
         return False
-    kind, enough = (
-        ('reflectors', ENOUGH_REFLECTORS) if robot.has_reflectors else ('tags', ENOUGH_TAGS)
-    )
+    kind, enough = robot.world.kind, robot.world.enough
     errors = np.array([error_of(*poses) for poses in located])
     position_m, heading_rad = _rms(errors[:, :2]), _rms(errors[:, 2:])
     sigma_m, sigma_rad, anees = _consistency(estimated)

@@ -144,21 +144,28 @@ class Localiser:
         """
         if self.loaded is None:
             return None
-        if self.is_localised and not state.is_mapping and self._contradiction.begins(update):
-            self.counts['contradicted_pose'] += 1
-            logger.warning('%s', found('contradicted_pose'))
+        is_elsewhere = self._is_elsewhere(state, update)
         reason = None
         if self._trial is not None and self._trial.vote(update, state.settings.max_rejections):
             reason = 'most landmarks contradict the pose that was given'
             if self._tag is not None:
                 reason = f'most landmarks contradict the pose that tag {self._tag} gave'
                 self._refused.add(self._tag)
-        elif self.is_localised and is_lost(state):
+        elif is_elsewhere or (self.is_localised and is_lost(state)):
             reason = 'all landmarks are far from where they should be'
         elif self.is_localised and self._unexplained.is_too_much(state, event, missed):
             reason = 'most of what is seen is not in the map'
         self.counts['lost'] += reason is not None
         return reason
+
+    def _is_elsewhere(self, state: State, update: Update) -> bool:
+        """Return whether enough of a map that does not change says so, one after the other."""
+        if not self.is_localised or state.is_mapping:
+            return False
+        if self._contradiction.begins(update):
+            self.counts['contradicted_pose'] += 1
+            logger.warning('%s', found('contradicted_pose'))
+        return self._contradiction.is_by(state.axes.point, state.settings.max_rejections)
 
     def search(self, state: State) -> bool:
         """Enter the map after an observation, if it is time to compare; return whether it did."""
@@ -328,6 +335,7 @@ class Contradiction:
 
     def __init__(self) -> None:
         self._moved: set[int] = set()
+        self._rejected: set[int] = set()  # since any was accepted
         self._times = self._since_ns = self._last_ns = 0
 
     @property
@@ -336,6 +344,14 @@ class Contradiction:
         is_long = self._last_ns - self._since_ns >= CONTRADICTED_NS
         return is_long and self._times >= CONTRADICTED_TIMES
 
+    def is_by(self, landmarks: int, often: int) -> bool:
+        """Return whether so many landmarks contradict the pose, each so often in the mean.
+
+        Where one is in view at a time, as of codes on a floor, each is seen a few times and left
+        behind: none is rejected as often as :func:`is_lost` asks of each.
+        """
+        return len(self._rejected) >= landmarks and self._times >= landmarks * often
+
     def begins(self, update: Update) -> bool:
         """Take what an observation has shown; return whether it begins to be so by that."""
         lasted = self.lasts
@@ -343,11 +359,12 @@ class Contradiction:
         accepted = set(update.ids[~update.rejected].tolist())
         if accepted:
             self._moved = (self._moved | rejected) - accepted
-            self._times = 0
+            self._times, self._rejected = 0, set()
         elif rejected - self._moved:
             if not self._times:
                 self._since_ns = update.stamp_ns
             self._times += 1
+            self._rejected |= rejected - self._moved
         self._last_ns = update.stamp_ns
         return self.lasts and not lasted
 

@@ -21,7 +21,16 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 @pytest.mark.ros
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built')
 @pytest.mark.parametrize(
-    'options', [[], ['--keep-pose'], ['--reflectors'], ['--reflectors', '--carried']], ids=' '.join
+    'options',
+    [
+        [],
+        ['--keep-pose'],
+        ['--reflectors'],
+        ['--reflectors', '--carried'],
+        ['--floor-codes'],
+        ['--floor-codes', '--carried'],
+    ],
+    ids=' '.join,
 )
 def test_the_robot_is_localised_before_and_after_what_happens_half_way(
     monkeypatch, capsys, options
