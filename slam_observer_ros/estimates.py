@@ -3,25 +3,140 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 import math
+from typing import Any
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
-UNUSED_POINTS = {
-    'rejected_landmark': 'rejected',
-    'unknown_id': 'without id',
-    'repeated_id': 'of a repeated id',
-    'reserved_id': 'of a reserved id',
-    'surplus_point': 'more than max_points',
-    'impossible_id': 'of an impossible id',
-    'bad_point': 'with NaN in what is stated of them',
-    'unmapped_landmark': 'not mapped',
-    'waiting_point': 'half points of landmarks that are not known yet',
-}
-"""Names under which observed points that are not used are counted, and what they are."""
+
+class Reason(Enum):
+    """Why a point that was observed is not used: each such point has exactly one reason.
+
+    The value is the name under which the points are counted in :attr:`.Estimator.counts`.
+    ``words`` follow a number of points, and ``remedy`` says what to do where these are many.
+    """
+
+    words: str
+    remedy: str
+
+    REJECTED = (
+        'rejected_landmark',
+        'rejected',
+        'see by how much with replay --explain ID, and look at signs, units, frames and noise',
+    )
+    NO_ID = 'unknown_id', 'without id', 'let the sensor give ids, or set gains: riccati'
+    REPEATED_ID = 'repeated_id', 'of a repeated id', 'give each landmark an id of its own'
+    RESERVED_ID = 'reserved_id', 'of a reserved id', 'give these landmarks other ids'
+    SURPLUS = 'surplus_point', 'more than max_points', 'let the sensor send fewer points'
+    IMPOSSIBLE_ID = (
+        'impossible_id',
+        'of an impossible id',
+        'look at what the driver writes there; -1 is a point without id',
+    )
+    BAD = (
+        'bad_point',
+        'with NaN in what is stated of them',
+        'let the driver state numbers; all zeros mean that a covariance is unknown',
+    )
+    UNMAPPED = (
+        'unmapped_landmark',
+        'not mapped',
+        'load the map of this place, or set max_landmarks higher',
+    )
+    WAITING = (
+        'waiting_point',
+        'half points of landmarks that are not known yet',
+        'drive a curve: they enter once one place fits',
+    )
+    CARRIED = (
+        'carried_point',
+        'of landmarks that move with the robot',
+        'do nothing if the robot carries them; where they stay behind they are used again',
+    )
+
+    def __new__(cls, name: str, words: str, remedy: str) -> Reason:
+        """Let a reason's value be its name."""
+        reason = object.__new__(cls)
+        reason._value_ = name
+        reason.words, reason.remedy = words, remedy
+        return reason
+
+
+class Change(Enum):
+    """What became of a landmark itself; the value is the name under which it is counted."""
+
+    words: str
+
+    FOUND = 'new_landmark', 'new in the map'
+    MOVED = 'moved_landmark', 'moved: it is where it was seen now'
+    MERGED = 'merged_landmark', 'merged with another landmark, which it is'
+    FORGOTTEN = 'forgotten_landmark', 'forgotten to make room (max_landmarks)'
+    UNSUPPORTED = 'unsupported_landmark', 'forgotten: seen too seldom while in view'
+    CARRIED = 'carried_landmark', 'moves with the robot'
+
+    def __new__(cls, name: str, words: str) -> Change:
+        """Let a change's value be its name."""
+        change = object.__new__(cls)
+        change._value_, change.words = name, words
+        return change
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a point or landmark when an observation of ``stamp_ns`` was used."""
+
+    stamp_ns: int
+    landmark_id: int
+    what: Reason | Change
+
+
+class Outcomes(Counter[str]):
+    """Counts of points and landmarks by what became of them; and each of them, if it is ``kept``.
+
+    What is kept is a chain, which a copy shares: hypotheses are copied at every observation.
+    """
+
+    def __init__(self, *args: Any, is_kept: bool = False) -> None:
+        super().__init__(*args)
+        self.is_kept = is_kept
+        self._chain: Any = None
+
+    def copy(self) -> Outcomes:
+        """Return an independent copy."""
+        other = Outcomes(self, is_kept=self.is_kept)
+        other._chain = self._chain
+        return other
+
+    def note(self, what: Reason | Change, ids: IntArray, stamp_ns: int) -> None:
+        """Count points or landmarks (m,) of which ``what`` has become of."""
+        if len(ids):
+            self[what.value] += len(ids)
+            if self.is_kept:
+                self._chain = (self._chain, what, ids, stamp_ns)
+
+    def add(self, other: Outcomes) -> None:
+        """Take in what others have counted and kept."""
+        self.update(other)
+        for what, ids, stamp_ns in list(other._links())[::-1]:
+            self._chain = (self._chain, what, ids, stamp_ns)
+
+    def _links(self) -> Iterator[tuple[Reason | Change, IntArray, int]]:
+        link = self._chain
+        while link is not None:
+            link, what, ids, stamp_ns = link
+            yield what, ids, stamp_ns
+
+    @property
+    def each(self) -> list[Outcome]:
+        """What was kept, in the order in which it happened."""
+        kept = list(self._links())[::-1]
+        return [Outcome(t, i, what) for what, ids, t in kept for i in ids.tolist()]
+
 
 DELAY_NAME = 'velocity_delay'
 """Name of the delay of velocities."""
@@ -29,7 +144,13 @@ DELAY_NAME = 'velocity_delay'
 
 def used_points(counts: Counter[str]) -> int:
     """Return how many points were used, from :attr:`.Estimator.counts`."""
-    return counts['observed_point'] - sum(counts[name] for name in UNUSED_POINTS)
+    return counts['observed_point'] - sum(counts[reason.value] for reason in Reason)
+
+
+def most_frequent(counts: Counter[str], among: Iterable[Reason] = Reason) -> Reason | None:
+    """Return the reason for which most points are not used; None where all are used."""
+    reason = max(among, key=lambda each: counts[each.value])
+    return reason if counts[reason.value] else None
 
 
 def point_share(counts: Counter[str], name: str) -> float:

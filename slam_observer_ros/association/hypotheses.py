@@ -32,7 +32,15 @@ from slam_observer_ros.association.joint_compatibility import (
 )
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
-from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, Update
+from slam_observer_ros.estimates import (
+    CalibrationEstimate,
+    Change,
+    DELAY_NAME,
+    Outcome,
+    Outcomes,
+    Reason,
+    Update,
+)
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
@@ -62,12 +70,12 @@ class Hypotheses:
     """Hypotheses about pose and map, the most likely first; at the start there is one."""
 
     def __init__(self, state: State) -> None:
-        self._earlier_counts: Counter[str] = Counter()
+        self._earlier_counts = Outcomes()
         self._start(state)
 
     def reset(self, state: State) -> None:
         """Replace all hypotheses by a new one."""
-        self._earlier_counts += self.best.counts
+        self._earlier_counts.add(self.best.counts)
         self._start(state)
 
     def _start(self, state: State) -> None:
@@ -86,6 +94,11 @@ class Hypotheses:
     def counts(self) -> Counter[str]:
         """Outcomes for landmarks, in the most likely state and those given up by resets."""
         return self._earlier_counts + self.best.counts
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """What became of points and landmarks, as :attr:`counts` counts it, if that was kept."""
+        return self._earlier_counts.each + self.best.counts.each
 
     def some_counts(self, names: Iterable[str]) -> list[int]:
         """Return some of the :attr:`counts`, without adding up all of them."""
@@ -221,7 +234,10 @@ class Hypotheses:
         if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
             self._judge(event)
         if standing.excluded:
-            event = event.without(standing.excluded)
+            whole, event = event, event.without(standing.excluded)
+            carried = whole.ids[~np.isin(whole.ids, event.ids)]
+            for hypothesis in self._all:
+                hypothesis.state.counts.note(Reason.CARRIED, carried, event.stamp_ns)
         return self._observe(event)
 
     def _judge(self, event: ObservationEvent) -> None:
@@ -237,8 +253,7 @@ class Hypotheses:
             if lost is not None:
                 take_back(state, lost)
                 state.counts['slip'] += not was_slipping
-            if newly:
-                state.counts['carried_landmark'] += len(newly)
+            state.counts.note(Change.CARRIED, np.array(sorted(newly)), event.stamp_ns)
         if best.is_mapping:
             for landmark_id in newly:
                 self.forget(landmark_id)

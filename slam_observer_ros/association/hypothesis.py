@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.estimates import Change
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.landmark_table import LandmarkTable
@@ -177,7 +178,7 @@ class Visibility:
         were_tentative = np.count_nonzero(landmarks.tentative)
         unsupported = landmarks.unsupported(state.settings.min_support)
         self.confirmed_now = int(were_tentative - np.count_nonzero(landmarks.tentative))
-        state.forget(unsupported, 'unsupported_landmark')
+        state.forget(unsupported, Change.UNSUPPORTED, event.stamp_ns)
         return cost
 
     def _has_moved(self, state: State) -> bool:

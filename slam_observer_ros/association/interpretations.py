@@ -107,7 +107,7 @@ def is_contradicted(state: State, matched: MatchedObservation) -> bool:
 
 def may_name(state: State, matched: MatchedObservation) -> bool:
     """Return whether a point's id may be that of a landmark which had none of its own so far."""
-    all_are_known = len(matched.known.ids) == len(matched.rows) + matched.left_out
+    all_are_known = len(matched.known.ids) == len(matched.rows) + len(matched.left_out)
     if all_are_known:
         return False
     return bool(is_automatic(state.landmarks.ids).any())

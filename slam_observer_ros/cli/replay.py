@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, replace
+import math
 from pathlib import Path
 
-from slam_observer_ros.cli.console import kept_warnings, print_json, print_table
+from slam_observer_ros.cli.console import kept_warnings, print_columns, print_json, print_table
 from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
 from slam_observer_ros.cli.outputs import add_force_option
 from slam_observer_ros.cli.replay_files import (
@@ -20,13 +22,14 @@ from slam_observer_ros.cli.replay_outcome import ReplayOutcome, with_logged
 from slam_observer_ros.cli.replay_request import add_run_options, read_request, warn_of_unused
 from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.common import __version__
-from slam_observer_ros.common.errors import LossError, OutputError
-from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
+from slam_observer_ros.common.errors import LossError, OutputError, UsageError
+from slam_observer_ros.estimates import point_share, Reason, used_points
+from slam_observer_ros.estimator.event_warnings import listed
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.opening import sha256_of
 from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, figure_text
 from slam_observer_ros.runs.input_health import list_dropped
-from slam_observer_ros.runs.reported_run import Replay
+from slam_observer_ros.runs.reported_run import Replay, Sighting
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names
 
@@ -70,19 +73,38 @@ def run(args: argparse.Namespace) -> None:
 def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
     """Write and print all that can be, and only then say what could not be written."""
     rows = summary_rows(outcome)
+    life = [] if args.explain is None else outcome.shown.life(args.explain)
     written, errors = write_files(args, outcome, map_frame, rows)
     if args.json:
         sha256 = sha256_of(args.recording)
-        print_json(identity(args.recording, sha256, outcome) | as_json(outcome))
+        figures = identity(args.recording, sha256, outcome) | as_json(outcome)
+        if args.explain is not None:
+            figures['landmark'] = {'id': args.explain, 'life': [asdict(line) for line in life]}
+        print_json(figures)
     else:
         rows |= {name: str(path) for name, path in written.items()}
         print_table(str(args.recording), rows)
+        if life:
+            _print_life(args.explain, life)
     if errors:
         raise OutputError('; '.join(errors))
+    if args.explain is not None and not life:
+        seen = listed(outcome.shown.seen_ids)
+        raise UsageError(f'--explain: no point had the id {args.explain}; there are {seen}')
     if args.strict and any(outcome.lost.values()):
         raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')
     if args.strict and outcome.unused_input:
         raise LossError(f'{args.recording}: --strict does not allow this: {outcome.unused_input}')
+
+
+def _print_life(landmark_id: int, life: Sequence[Sighting]) -> None:
+    """Print what came of each observation of a landmark, and of the landmark itself."""
+    lines = []
+    for each in life:
+        has_residual = not math.isnan(each.sigmas)
+        residual = (f'{each.sigmas:.2f}', f'{each.residual_m:.3f}') if has_residual else ('–', '–')
+        lines.append((f'{each.seconds:9.3f}  {each.what}', *residual))
+    print_columns(f'landmark {landmark_id}', ('time, s', 'residual, σ', 'm'), lines)
 
 
 NEARLY_ALL = 0.99
@@ -208,9 +230,10 @@ def _points_text(counts: Counter[str]) -> str:
     """Say how many points were used, and why the others were not."""
     parts = [f'{used_points(counts)} used']
     parts += [
-        f'{counts[name]} {reason} ({100.0 * point_share(counts, name):.1f} %)'
-        for name, reason in UNUSED_POINTS.items()
-        if counts[name]
+        f'{counts[reason.value]} {reason.words} '
+        f'({100.0 * point_share(counts, reason.value):.1f} %)'
+        for reason in Reason
+        if counts[reason.value]
     ]
     return ', '.join(parts)
 

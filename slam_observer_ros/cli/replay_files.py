@@ -46,6 +46,13 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
     outputs.add_argument(
         '--with-inputs', action='store_true', help='--mcap has the messages that came in, too'
     )
+    outputs.add_argument(
+        '--explain',
+        type=int,
+        metavar='ID',
+        help='print the life of a landmark, too: when it was new, the residual of each '
+        'observation, and why points of it were not used',
+    )
     outputs.add_argument('--json', action='store_true', help='print one JSON object')
 
 
@@ -54,7 +61,7 @@ def records_of(args: argparse.Namespace) -> Records:
     return Records(
         poses=args.tum is not None,
         nis=args.json,
-        whole_run=args.report is not None,
+        whole_run=args.report is not None or args.explain is not None,
         map=args.map is not None,
         mcap=args.mcap,
         with_inputs=args.with_inputs,

@@ -167,6 +167,7 @@ def outcome_of(
             configuration=result.configuration,
             instants=recorder.finish(estimator),
             innovations=recorder.innovations,
+            outcomes=estimator.outcomes,
         )
     return ReplayOutcome(
         selected,

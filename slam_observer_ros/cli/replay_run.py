@@ -16,7 +16,7 @@ from slam_observer_ros.cli.replay_request import Records, ReplayRequest, select_
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import is_automatic
-from slam_observer_ros.estimates import UNUSED_POINTS
+from slam_observer_ros.estimates import Reason
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -171,7 +171,7 @@ def _advice(result: Replay) -> str:
     if counts['unknown_id']:
         return f'; {counts["unknown_id"]} points without id take --gains riccati'
     if 2 * counts['repeated_id'] > counts['observed_point']:
-        return f'; {counts["repeated_id"]} points were {UNUSED_POINTS["repeated_id"]}'
+        return f'; {counts["repeated_id"]} points were {Reason.REPEATED_ID.words}'
     if settings.set_initial_pose:
         return '; they contradict the pose that was given'
     return (

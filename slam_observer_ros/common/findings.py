@@ -299,7 +299,7 @@ KINDS = {
     'left_out_points': Kind(
         Level.WARNING,
         'of {count} points seen {reasons}',
-        'see under Troubleshooting what these mean; ids are what the sensor gives',
+        '{remedy}',
     ),
     'point_noise': Kind(
         Level.NOTE,
@@ -457,11 +457,6 @@ KINDS = {
         Level.WARNING,
         'points without an id are not used by {gains} gains',
         'only riccati gains use them',
-    ),
-    'half_point_without_id': Kind(
-        Level.WARNING,
-        'not used: {count} bearings or ranges alone of an observation, which have no id',
-        'let the driver say of which landmark each is: by where it is none is recognised',
     ),
     'bad_point': Kind(
         Level.WARNING,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 import math
@@ -18,6 +17,7 @@ from slam_observer_ros.common.types import (
     is_automatic,
     LAST_AUTOMATIC_ID,
 )
+from slam_observer_ros.estimates import Outcomes, Reason
 from slam_observer_ros.estimator.event_warnings import EventWarnings, listed
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -27,7 +27,6 @@ from slam_observer_ros.events import (
     IMPOSSIBLE_ID,
     MAX_ID,
     ObservationEvent,
-    POINT,
     UNKNOWN_ID,
     VelocityBlock,
     VelocityEvent,
@@ -90,8 +89,8 @@ def check_event(event: Event, settings: Settings) -> None:
     _check_times(event.stamp_ns, event.receive_ns)
 
 
-def finite_points(event: ObservationEvent) -> ObservationEvent | None:
-    """Return an observation without points of which something is NaN or infinite; None if all.
+def are_finite(event: ObservationEvent) -> BoolArray | None:
+    """Return of which points (m,) nothing is NaN or infinite; None where that is of no point.
 
     A covariance that one tag misses says nothing against the other tags of the message.
     """
@@ -100,7 +99,7 @@ def finite_points(event: ObservationEvent) -> ObservationEvent | None:
         if not _is_plain(array) or len(array) != m or array.dtype.kind not in 'fiu':
             return None
         fit &= np.isfinite(array).reshape(m, -1).all(axis=1)
-    return event.select(fit) if fit.any() else None
+    return fit if fit.any() else None
 
 
 def are_vague(event: ObservationEvent) -> BoolArray:
@@ -360,7 +359,7 @@ def usable_points(
     settings: Settings,
     gains: Gains,
     landmarks: LandmarkTable,
-    counts: Counter[str],
+    counts: Outcomes,
     warnings: EventWarnings,
 ) -> ObservationEvent:
     """Return an observation as the states use it; count its points, warn of those left out."""
@@ -380,35 +379,32 @@ def usable_points(
         return event
     if (impossible := event.ids == IMPOSSIBLE_ID).any():
         warnings.warn('impossible_id', count=int(np.sum(impossible)))
-        counts['impossible_id'] += int(np.sum(impossible))
+        counts.note(Reason.IMPOSSIBLE_ID, event.ids[impossible], event.stamp_ns)
         event = event.select(~impossible)
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
         named = listed(event.ids[reserved].tolist())
         warnings.warn('reserved_id', ids=named, first=FIRST_AUTOMATIC_ID, last=LAST_AUTOMATIC_ID)
-        counts['reserved_id'] += int(np.sum(reserved))
+        counts.note(Reason.RESERVED_ID, event.ids[reserved], event.stamp_ns)
         event = event.select(~reserved)
     if repeated_ids := event.repeated_ids():  # nobody knows which of the points is right
         warnings.warn('repeated_id', ids=listed(repeated_ids))
         repeated = np.isin(event.ids, repeated_ids)
-        counts['repeated_id'] += int(np.sum(repeated))
+        counts.note(Reason.REPEATED_ID, event.ids[repeated], event.stamp_ns)
         event = event.select(~repeated)
     unknown = event.ids == UNKNOWN_ID
-    if event.kinds is not None and (halves := unknown & (event.kinds != POINT)).any():
-        warnings.warn('half_point_without_id', count=int(np.sum(halves)))
-        counts['unknown_id'] += int(np.sum(halves))
-        event, unknown = event.select(~halves), unknown[~halves]
     can_weigh = gains.errors is not None
     if not can_weigh and np.count_nonzero(unknown):
         warnings.warn('unknown_id', gains=settings.gains)
-        counts['unknown_id'] += int(np.sum(unknown))
+        counts.note(Reason.NO_ID, event.ids[unknown], event.stamp_ns)
         event = event.select(~unknown)
     elif can_weigh and len(event.ids) > settings.max_points:
         count, most = len(event.ids), settings.max_points
         source = event.sensor_frame or 'a sensor'
         warnings.warn('surplus_point', source=source, count=count, most=most)
-        counts['surplus_point'] += count - most
-        event = event.select(_most_useful(event, landmarks.ids, most))
+        useful = _most_useful(event, landmarks.ids, most)
+        counts.note(Reason.SURPLUS, event.ids[~useful], event.stamp_ns)
+        event = event.select(useful)
     return event
 
 

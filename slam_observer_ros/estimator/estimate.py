@@ -10,7 +10,14 @@ import numpy as np
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
+from slam_observer_ros.estimates import (
+    CalibrationEstimate,
+    MotionFactor,
+    Outcome,
+    Outcomes,
+    Smoothed,
+    Update,
+)
 from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.estimator.timeline import Timeline
 from slam_observer_ros.geometry import se3
@@ -35,7 +42,7 @@ class Estimate:
         self.jumps = 0  # how often the clock has jumped
         self.last_update: Update | None = None  # None before the first observation
         self._hypotheses, self._localiser = hypotheses, localiser
-        self._counts: Counter[str] = Counter()
+        self._counts = Outcomes(is_kept=hypotheses.best.counts.is_kept)
         self._warnings = EventWarnings()
 
     @property
@@ -56,6 +63,15 @@ class Estimate:
         covariance says nothing.
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """What became of each unused point and each landmark, by stamp, if that was kept.
+
+        Points that were used, and the residuals of rejected ones, are in each :class:`.Update`.
+        """
+        each = self._counts.each + self._hypotheses.outcomes
+        return sorted(each, key=lambda outcome: outcome.stamp_ns)
 
     @property
     def is_contradicted(self) -> bool:

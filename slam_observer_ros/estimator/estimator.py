@@ -14,11 +14,11 @@ from slam_observer_ros.common.errors import InvalidEventError, ParameterError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimates import Reason, Update
 from slam_observer_ros.estimator.checks import (
+    are_finite,
     check_event,
     check_velocities,
-    finite_points,
     rigid,
     usable_maps,
     usable_points,
@@ -64,7 +64,8 @@ class Estimator(Estimate):
     :meth:`flush`; since the first of them only velocities have moved the state. ``on_motion`` is
     called with velocities and two stamps before the state is moved on between these, and
     ``on_jump`` when the estimate has gone on after a jump of the clock. ``judges_innovations``
-    adds :attr:`.Update.innovation`, which takes time.
+    adds :attr:`.Update.innovation`, which takes time, and ``keeps_outcomes`` keeps what became of
+    each unused point and each landmark, for :attr:`.Estimate.outcomes`: memory grows with these.
     """
 
     def __init__(
@@ -76,10 +77,11 @@ class Estimator(Estimate):
         on_motion: OnMotion | None = None,
         on_jump: Callable[[], None] | None = None,
         judges_innovations: bool = False,
+        keeps_outcomes: bool = False,
     ) -> None:
         settings = checked(settings)
         self._live = LiveSettings.of(settings)
-        self._placement = Placement(self._live, judges_innovations)
+        self._placement = Placement(self._live, judges_innovations, keeps_outcomes)
         super().__init__(settings, self._placement.hypotheses, self._placement.localiser)
         self._on_update, self._on_stamps = on_update, on_stamps
         self._on_motion, self._on_jump = on_motion, on_jump
@@ -200,18 +202,18 @@ class Estimator(Estimate):
             self._take(event)
         except InvalidEventError as error:
             if error.reason == 'not_finite' and isinstance(event, ObservationEvent):
-                usable = finite_points(event)
-                if usable is not None:
-                    self._count_bad(len(event.ids) - len(usable.ids))
-                    return self.add(usable)
+                fit = are_finite(event)
+                if fit is not None:
+                    self._count_bad(event.ids[~fit], event.stamp_ns)
+                    return self.add(event.select(fit))
             self._drop(error)
             return False
         return True
 
-    def _count_bad(self, count: int) -> None:
-        self._warnings.warn('bad_point', count=count)
-        self._counts['observed_point'] += count
-        self._counts['bad_point'] += count
+    def _count_bad(self, ids: IntArray, stamp_ns: int) -> None:
+        self._warnings.warn('bad_point', count=len(ids))
+        self._counts['observed_point'] += len(ids)
+        self._counts.note(Reason.BAD, ids, stamp_ns)
 
     def add_velocities(self, velocities: VelocityBlock) -> int:
         """Take velocities, each as :meth:`add` takes it; return how many were accepted.

@@ -10,7 +10,7 @@ import numpy as np
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimates import Outcomes, Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -42,11 +42,15 @@ class Placement:
     """Starts ``hypotheses``, and moves them into the frame of a map that the ``localiser`` has.
 
     ``was_placed`` is whether somebody has said where the robot is, so that the pose of the
-    settings is not where it starts. ``judges_innovations`` is as for :class:`.Estimator`.
+    settings is not where it starts. ``judges_innovations`` and ``keeps_outcomes`` are as for
+    :class:`.Estimator`.
     """
 
-    def __init__(self, settings: LiveSettings, judges_innovations: bool) -> None:
-        self._settings, self._judges_innovations = settings, judges_innovations
+    def __init__(
+        self, settings: LiveSettings, judges_innovations: bool, keeps_outcomes: bool
+    ) -> None:
+        self._settings = settings
+        self._judges_innovations, self._keeps_outcomes = judges_innovations, keeps_outcomes
         self.hypotheses = Hypotheses(self._state_at(np.eye(4)))
         self.localiser = Localiser()
         self.was_placed = False
@@ -144,6 +148,7 @@ class Placement:
         """Return a state at its start, with P° = ``pose`` (4, 4)."""
         state = State(make_gains(self._settings, pose), self._settings)
         state.judges_innovations = self._judges_innovations
+        state.counts = Outcomes(is_kept=self._keeps_outcomes)
         return state
 
     def _allowed(self, pose: FloatArray) -> FloatArray:

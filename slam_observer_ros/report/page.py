@@ -16,6 +16,7 @@ from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.estimates import Reason
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.report.curves import (
     calibration,
@@ -103,6 +104,7 @@ def report_data(run: ReportedRun) -> dict[str, Json]:
         'errors': errors(run),
         'consistency': consistency(run),
         'residuals': _residuals(run),
+        'outcomes': _outcomes(run),
         'gate': run.settings.rejection_threshold,
         'calibration': calibration(run),
         'drops': drops(run),
@@ -241,9 +243,28 @@ def _residuals(run: ReportedRun) -> dict[str, Json]:
         't': rounded(run.seconds(innovations.stamps_ns[shown]), 2),
         'id': innovations.ids[shown].tolist(),
         'sigma': rounded(innovations.distances[shown], 2),
+        'm': rounded(innovations.residuals_m[shown], 3),
         'weight': rounded(innovations.weights[shown], 2),
         'moved': np.flatnonzero(innovations.moved[shown]).tolist(),
         'left_out': int(np.count_nonzero(~shown)),
+    }
+
+
+def _outcomes(run: ReportedRun) -> dict[str, Json]:
+    """Return what became of landmarks, and why points were not used that have no residual."""
+    seen = run.innovations
+    judged = set(zip(seen.stamps_ns.tolist(), seen.ids.tolist(), strict=True))
+    each = [
+        one
+        for one in run.outcomes
+        if one.what is not Reason.REJECTED or (one.stamp_ns, one.landmark_id) not in judged
+    ]
+    each = each[thinned(len(each), MAX_RESIDUALS)]
+    stamps_ns = np.array([one.stamp_ns for one in each], dtype=np.int64)
+    return {
+        't': rounded(run.seconds(stamps_ns), 2),
+        'id': [one.landmark_id for one in each],
+        'what': [one.what.words for one in each],
     }
 
 

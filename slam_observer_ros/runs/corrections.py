@@ -20,7 +20,6 @@ from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
     ObservationEvent,
-    POINT,
     UNKNOWN_ID,
     VelocityEvent,
 )
@@ -201,10 +200,7 @@ def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
         if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
             break
         if isinstance(event, ObservationEvent):
-            usable = event.ids != UNKNOWN_ID
-            if event.kinds is not None:
-                usable &= event.kinds == POINT
-            kept.append(event.select(usable))
+            kept.append(event.select(event.ids != UNKNOWN_ID))
             continue
         kept.append(event)
         if isinstance(event, VelocityEvent):

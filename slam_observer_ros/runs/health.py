@@ -17,10 +17,11 @@ from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.estimates import (
     CalibrationEstimate,
     DELAY_NAME,
+    most_frequent,
     MotionFactor,
     point_share,
     RangePower,
-    UNUSED_POINTS,
+    Reason,
     Update,
 )
 from slam_observer_ros.geometry.matrices import MAX_DEVIATION
@@ -39,17 +40,17 @@ MAX_VAGUE = 0.5
 """Share of the points, stated to be anywhere, beyond which they are what the sensor states."""
 
 LEFT_OUT = (
-    'rejected_landmark',
-    'unknown_id',
-    'repeated_id',
-    'reserved_id',
-    'impossible_id',
-    'surplus_point',
-    'bad_point',
+    Reason.REJECTED,
+    Reason.NO_ID,
+    Reason.REPEATED_ID,
+    Reason.RESERVED_ID,
+    Reason.IMPOSSIBLE_ID,
+    Reason.SURPLUS,
+    Reason.BAD,
 )
 """Points not used for something that is wrong, as one that a known map has not may be right."""
 
-WRONG_IDS = ('repeated_id', 'reserved_id', 'impossible_id')
+WRONG_IDS = (Reason.REPEATED_ID, Reason.RESERVED_ID, Reason.IMPOSSIBLE_ID)
 """Of those, what a sensor should never give: one is enough to say so."""
 
 NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
@@ -123,6 +124,9 @@ def estimator_values(
     update = estimator.last_update
     values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
     values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
+    if (most := most_frequent(estimator.counts)) is not None:
+        count = estimator.counts[most.value]
+        values['most points not used'] = f'{count} {most.words}: {most.remedy}'
     values['landmarks known'] = str(len(estimator.landmark_ids))
     values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
     values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
@@ -274,12 +278,16 @@ def of_rejections(counts: Counter[str], when: str = '') -> list[Finding]:
 
 def of_left_out(counts: Counter[str], level: Level) -> list[Finding]:
     """Report points that were left out: most of them, or for their ids."""
-    left_out = {name: counts[name] for name in LEFT_OUT if counts[name]}
-    of_wrong_ids = any(counts[name] for name in WRONG_IDS)
-    if not (of_wrong_ids or 2 * sum(left_out.values()) > counts['observed_point']):
+    left_out = {reason: counts[reason.value] for reason in LEFT_OUT if counts[reason.value]}
+    of_wrong_ids = any(reason in left_out for reason in WRONG_IDS)
+    most = most_frequent(counts, WRONG_IDS if of_wrong_ids else LEFT_OUT)
+    is_much = of_wrong_ids or 2 * sum(left_out.values()) > counts['observed_point']
+    if most is None or not is_much:
         return []
-    reasons = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())
-    finding = found('left_out_points', count=counts['observed_point'], reasons=reasons)
+    reasons = ', '.join(f'{count} {reason.words}' for reason, count in left_out.items())
+    finding = found(
+        'left_out_points', count=counts['observed_point'], reasons=reasons, remedy=most.remedy
+    )
     return [replace(finding, level=level)]
 
 

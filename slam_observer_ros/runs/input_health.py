@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from slam_observer_ros.common.findings import Finding, found
-from slam_observer_ros.estimates import UNUSED_POINTS
+from slam_observer_ros.estimates import Reason
 from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
 from slam_observer_ros.recording.contents import Arrivals
 from slam_observer_ros.recording.reader import Recording
@@ -82,7 +82,7 @@ def of_use(
 def _unused_points(counts: Counter[str]) -> Counter[str]:
     """Return how many observations had no point that is used, and why the points were not."""
     return Counter({'without a point that is used': counts['observation']}) + Counter(
-        {f'points {why}': counts[name] for name, why in UNUSED_POINTS.items()}
+        {f'points {reason.words}': counts[reason.value] for reason in Reason}
     )
 
 

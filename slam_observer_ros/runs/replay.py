@@ -21,7 +21,7 @@ from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityBlock
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, Truth
-from slam_observer_ros.runs.reported_run import Replay
+from slam_observer_ros.runs.reported_run import Replay, RunRecorder
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.sensor_models.sensing import RangeErrors
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
@@ -97,6 +97,7 @@ class _RunningReplay:
             on_motion=self._untimed(self._on_motion),
             on_jump=self._untimed(self._on_jump),
             judges_innovations=bool(recorders),
+            keeps_outcomes=any(isinstance(each, RunRecorder) for each in recorders),
         )
         self._in_known_map = landmark_map is not None
         self._in_fixed_map = self._in_known_map and settings.localization_mode == 'fixed'

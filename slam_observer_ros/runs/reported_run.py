@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -16,12 +17,15 @@ from slam_observer_ros.estimates import (
     CalibrationEstimate,
     Innovations,
     Instant,
+    Outcome,
     RangePower,
+    Reason,
     Update,
 )
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.evaluation.metrics import ConfigurationError, pose_errors, TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import interpolate, LandmarkTruth, Trajectory
+from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -209,6 +213,22 @@ MIN_GAP_S = 3.0
 """Shortest stretch without a used landmark that is marked."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """An observation of a landmark, or a change of the landmark itself, and what came of it."""
+
+    seconds: float  # since the first event of the run
+    sigmas: float  # Mahalanobis distance of the residual before the correction; NaN if unknown
+    residual_m: float
+    what: str
+
+
+def _use(weight: float) -> str:
+    if weight == 0.0:
+        return Reason.REJECTED.words
+    return 'used' if weight == 1.0 else f'used with weight {weight:.2f}'
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportedRun:
     """A replay with what was recorded of it, from ``start_ns`` on.
@@ -229,9 +249,37 @@ class ReportedRun:
     configuration: ConfigurationError
     instants: Sequence[Instant]
     innovations: Innovations
+    outcomes: Sequence[Outcome]
     smoothed: Trajectory | None = None
     smoothed_points: FloatArray | None = None  # (n, 3) landmarks, metres, world
     smoothed_errors: TrajectoryErrors | None = None
+
+    @property
+    def seen_ids(self) -> list[int]:
+        """Ids that points had, ascending."""
+        others = {each.landmark_id for each in self.outcomes}
+        return sorted(others.union(self.innovations.ids.tolist()) - {UNKNOWN_ID})
+
+    def life(self, landmark_id: int) -> list[Sighting]:
+        """Return what came of each observation of a landmark, and of itself, by time."""
+        seen, of_it = self.innovations, self.innovations.ids == landmark_id
+        lines = [
+            Sighting(seconds, sigmas, residual_m, _use(weight))
+            for seconds, sigmas, residual_m, weight in zip(
+                self.seconds(seen.stamps_ns[of_it]).tolist(),
+                seen.distances[of_it].tolist(),
+                seen.residuals_m[of_it].tolist(),
+                seen.weights[of_it].tolist(),
+                strict=True,
+            )
+        ]
+        judged_ns = set(seen.stamps_ns[of_it].tolist())
+        others = [each for each in self.outcomes if each.landmark_id == landmark_id]
+        stamps_ns = np.array([each.stamp_ns for each in others], dtype=np.int64)
+        for each, seconds in zip(others, self.seconds(stamps_ns).tolist(), strict=True):
+            if each.what is not Reason.REJECTED or each.stamp_ns not in judged_ns:
+                lines.append(Sighting(seconds, math.nan, math.nan, each.what.words))
+        return sorted(lines, key=lambda line: line.seconds)
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Return times since the first event of the run, seconds."""

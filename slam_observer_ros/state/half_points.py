@@ -9,7 +9,6 @@ directions and a completed point are the same correction, but for rounding.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 import math
@@ -17,7 +16,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimates import Outcomes, Reason, Update
 from slam_observer_ros.events import (
     AZIMUTH,
     AZIMUTH_RANGE,
@@ -25,6 +24,7 @@ from slam_observer_ros.events import (
     ObservationEvent,
     POINT,
     RANGE,
+    UNKNOWN_ID,
 )
 from slam_observer_ros.geometry.sensor_mounting import directions_of
 from slam_observer_ros.sensor_models.observation_noise import point_covariances
@@ -55,7 +55,7 @@ _LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
 class HalfPoints:
     """Completes what sensors measure, by a state and by the views that wait."""
 
-    def __init__(self, counts: Counter[str]) -> None:
+    def __init__(self, counts: Outcomes) -> None:
         self._counts = counts
         self._waiting = WaitingRoom()
         self.heights_m: Mapping[int, float] = {}  # of the landmarks of a loaded map
@@ -88,7 +88,9 @@ class HalfPoints:
             return event
         # Zero residuals where nothing was measured would say that the motion is exact.
         state.motion_noise.factors.forget_motion()
-        event = _with_sensor(state, event)
+        is_named = (event.ids != UNKNOWN_ID) | (event.kinds == POINT)
+        self._counts.note(Reason.NO_ID, event.ids[~is_named], event.stamp_ns)
+        event = _with_sensor(state, event.select(is_named))
         rows = state.landmarks.rows_of(event.ids)
         lines, covariances = _completed(state, event, rows)
         entered = np.zeros(len(rows), dtype=np.bool_)
@@ -100,7 +102,7 @@ class HalfPoints:
                     lines[row], covariances[row] = found
                     entered[row] = True
         usable = (rows >= 0) | (event.kinds == POINT) | entered
-        self._counts['waiting_point'] += int(np.count_nonzero(~usable))
+        self._counts.note(Reason.WAITING, event.ids[~usable], event.stamp_ns)
         kinds = np.asarray(event.kinds)
         kinds = np.where(entered, POINT, kinds)
         points = event.points - event.lines_of_sight + lines

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import NormalisedInnovation
+from slam_observer_ros.estimates import Change, NormalisedInnovation, Reason
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis
@@ -37,19 +37,19 @@ class MatchedObservation:
     covariances: FloatArray  # (m, 3, 3) of the points, body frame, m²
     known: ObservationEvent  # the points of known landmarks …
     residuals: Residuals  # … and theirs
-    left_out: int  # points of the observation that are not in ``event``
+    left_out: IntArray  # ids of the observation's points that are not in ``event``
 
 
 def match(state: State, event: ObservationEvent) -> MatchedObservation:
     """Match an observation made at the state's instant with landmarks by their ids."""
     event = calibrated(state, event)
-    m, rows = len(event.ids), state.landmarks.rows_of(event.ids)
+    rows, left_out = state.landmarks.rows_of(event.ids), event.ids[:0]
     if not state.is_mapping:
+        left_out = event.ids[rows < 0]
         event, rows = mapped(state, event)
     is_known = rows >= 0
     state.gains.activate(rows[is_known])  # before anything is asked of them
     covariances = point_covariances(state, event, rows)
-    left_out = m - len(event.ids)
     if np.count_nonzero(is_known) == len(rows):  # as nearly always
         residuals = residuals_of(state, event, rows, covariances)
         return MatchedObservation(event, rows, covariances, event, residuals, left_out)
@@ -96,11 +96,12 @@ def enter(state: State, event: ObservationEvent, noise: FloatArray) -> None:
     """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
     limit, new = state.settings.max_landmarks, len(event.ids)
     m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
-    state.counts['unmapped_landmark'] += new - m
+    state.counts.note(Reason.UNMAPPED, event.ids[m:], event.stamp_ns)
     if m:
         event = calibrated_again(state, event.select(np.arange(new) < m))
         state.gains.add(event.points, noise[:m], sensitivity(state, event))
         state.landmarks.add(event.ids, event.stamp_ns)
+        state.counts.note(Change.FOUND, event.ids, event.stamp_ns)
 
 
 def residuals_of(
@@ -143,7 +144,7 @@ def reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray)
 
     But not what is off by the sensor's lasting error, while the robot stands: that is no news.
     """
-    state.counts['rejected_landmark'] += len(rows)
+    state.counts.note(Reason.REJECTED, event.ids, event.stamp_ns)
     if state.observation_noise.stood_s > 0.0:
         far = beyond_driving(event.points, r, state.settings)
         event, rows = event.select(far), rows[far]

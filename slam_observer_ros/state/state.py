@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from copy import copy
 
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import NormalisedInnovation, Smoothed, Update
+from slam_observer_ros.estimates import Change, NormalisedInnovation, Outcomes, Smoothed, Update
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import correlations_of
 from slam_observer_ros.observer.gains import Errors, Gains
@@ -45,7 +44,7 @@ class State:
         self.relinearisation = Past()
         if self.errors is not None and not self.landmark_velocity_stddev:
             self.relinearisation = Relinearisation(self.errors, self.calibration, settings)
-        self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
+        self.counts = Outcomes()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
         self.was_contradicted = False  # most known landmarks seen last were rejected
         self.observation_noise = ObservationNoise(settings)
@@ -229,14 +228,15 @@ class State:
         square = self.gains.merge(rows, copies, most)
         if square <= most:
             self.relinearisation.merge(rows, copies)
-            self.counts['merged_landmark'] += len(rows)
+            ids, seen_ns = self.landmarks.ids[copies], self.landmarks.last_seen_ns
+            self.counts.note(Change.MERGED, ids, int(seen_ns.max()))
         return square
 
-    def forget(self, rows: IntArray, why: str) -> None:
-        """Remove landmarks, if there are any at ``rows``; ``why`` is the count they go to."""
+    def forget(self, rows: IntArray, why: Change, stamp_ns: int) -> None:
+        """Remove landmarks, if there are any at ``rows``, and count them."""
         if len(rows):
+            self.counts.note(why, self.landmarks.ids[rows], stamp_ns)
             self.remove(rows)
-            self.counts[why] += len(rows)
 
     def fix_landmarks(self, known: KnownLandmarks) -> None:
         """Take all landmarks for exact and at rest where a map has them."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimates import Change, Reason, Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.arrays import SeenOrientations
 from slam_observer_ros.observer.observer import Residuals
@@ -65,8 +65,7 @@ def _correct(state: State, residuals: Residuals) -> FloatArray:
 def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> None:
     """Count which known landmarks (m,) were accepted, and which rejected."""
     event, rows, count = matched.known, matched.residuals.rows, int(np.count_nonzero(rejected))
-    if matched.left_out:
-        state.counts['unmapped_landmark'] += matched.left_out
+    state.counts.note(Reason.UNMAPPED, matched.left_out, event.stamp_ns)
     if not len(rows):
         return
     state.rejected_in_a_row = state.rejected_in_a_row + 1 if count == len(rows) else 0
@@ -102,7 +101,7 @@ def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEven
     if len(matched.known.ids) == len(rows):
         return event, rows
     is_new = rows < 0
-    state.forget(_rows_to_forget(state, matched), 'forgotten_landmark')
+    state.forget(_rows_to_forget(state, matched), Change.FORGOTTEN, event.stamp_ns)
     enter(state, event.select(is_new), matched.covariances[is_new])
     return mapped(state, event)
 
@@ -115,7 +114,7 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     gate = state.settings.rejection_threshold
     far = ~accepted(state.gains.distances(residuals), gate)
     moved = far & (state.landmarks.counts[rows] >= state.settings.confirmations)
-    state.counts['moved_landmark'] += int(np.sum(moved))
+    state.counts.note(Change.MOVED, event.ids[moved], event.stamp_ns)
     if far.any():
         moved_to = event.select(far)
         state.relocate(rows[far], moved_to.points, noise[far], sensitivity(state, moved_to))

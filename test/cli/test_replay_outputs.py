@@ -27,6 +27,29 @@ class TestOutputs:
         assert all(len(landmark['position']) == 3 for landmark in content['landmarks'])
         assert content['landmarks'][0]['observations'] == 251
 
+    def test_the_life_of_a_landmark_is_explained(self, slam_observer, simulated):
+        """When it was new, and what came of each observation of it."""
+        printed = slam_observer.succeed('replay', simulated, '--explain', 2).output
+        assert re.search(r'landmark 2 *\n', printed)
+        assert re.search(r'0\.000  new in the map', printed)
+        (first, *others) = slam_observer.succeed(
+            'replay', simulated, '--explain', 2, '--json'
+        ).json['landmark']['life']
+        assert (first['what'], first['sigmas']) == ('new in the map', None)
+        assert len(others) == 250
+        assert {other['what'].split(' with')[0] for other in others} == {'used'}
+        assert all(other['sigmas'] > 0.0 for other in others)
+
+    def test_a_landmark_that_was_never_seen_is_named_after_all_is_written(
+        self, slam_observer, simulated, tmp_path
+    ):
+        refused = slam_observer(
+            'replay', simulated, '--explain', 99, '--tum', tmp_path / 'run.tum'
+        )
+        assert refused.code == 2
+        assert '--explain: no point had the id 99; there are 0, 1, 2, 3' in refused.errors
+        assert len(read_tum(tmp_path / 'run.tum')) == 84
+
     def test_people_read_degrees_and_programs_radians(self, slam_observer, simulated):
         figures = slam_observer.succeed('replay', simulated, '--json').json
         (row,) = (

@@ -305,6 +305,20 @@ def test_landmarks_that_are_believed_moved_are_marked(slam_observer, tmp_path):
     assert 'believed moved' in open_page(report).html
 
 
+def test_a_click_on_a_landmark_shows_what_came_of_each_observation(report):
+    script = """
+        const lines = () => [...document.querySelectorAll('#life-table tbody tr')];
+        document.querySelector('#landmarks tbody button').click();
+        const shown = document.querySelector('#life h2').textContent;
+        const whats = lines().map((line) => line.children[3].textContent);
+        document.title = [shown, document.getElementById('life').hidden, whats[0],
+            whats.length > 10, whats.slice(1).every((what) => what.startsWith('used'))].join();
+    """
+    (first, *_) = numbers_of(report)['landmarks']
+    shown = f'Landmark {first[0]},false,new in the map,true,true'
+    assert run_in_page(report, script) == shown
+
+
 def test_moving_the_slider_moves_the_robot(report):
     moved = report.with_name('moved.html')
     script = (

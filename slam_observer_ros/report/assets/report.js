@@ -145,8 +145,9 @@ function drawMap(id, view) {
   Plotly.newPlot(id, data, layout, plotSettings());
   element(id).dataset.still = String(still);
   /** @type {any} */ (element(id)).on('plotly_click', (/** @type {any} */ event) => {
-    const t = event.points[0].customdata;
+    const { customdata: t, data, text } = event.points[0];
     if (typeof t === 'number') goTo(t);
+    if (data.name === 'landmarks') showLife(Number(text));
   });
 }
 
@@ -189,7 +190,7 @@ function rows() {
   /** @param {(w: number, i: number) => boolean} test @param {any} y @param {string} name @param {any} marker */
   const some = (test, y, name, marker) => {
     const rows = residuals.weight.map((/** @type {number} */ w, /** @type {number} */ i) => i).filter((/** @type {number} */ i) => test(residuals.weight[i], i));
-    return { x: rows.map((/** @type {number} */ i) => residuals.t[i]), y: rows.map((/** @type {number} */ i) => y(i)), text: rows.map((/** @type {number} */ i) => `landmark ${ids[i]}: ${residuals.sigma[i]} σ`), name, mode: 'markers', marker, hovertemplate: '%{text}<extra></extra>' };
+    return { x: rows.map((/** @type {number} */ i) => residuals.t[i]), y: rows.map((/** @type {number} */ i) => y(i)), text: rows.map((/** @type {number} */ i) => `landmark ${ids[i]}: ${residuals.sigma[i]} σ`), customdata: rows.map((/** @type {number} */ i) => ids[i]), name, mode: 'markers', marker, hovertemplate: '%{text}<extra></extra>' };
   };
   const known = residuals.sigma.some((/** @type {number} */ s) => s > 0);
   /** @param {any} y @param {boolean} legend */
@@ -251,7 +252,10 @@ function drawCurves() {
     return;
   }
   drawRows(place, all);
-  /** @type {any} */ (place).on('plotly_click', (/** @type {any} */ event) => goTo(event.points[0].x));
+  /** @type {any} */ (place).on('plotly_click', (/** @type {any} */ event) => {
+    goTo(event.points[0].x);
+    if (typeof event.points[0].customdata === 'number') showLife(event.points[0].customdata);
+  });
 }
 
 /** @param {HTMLElement} place @param {Row[]} all */
@@ -357,6 +361,32 @@ function fillTable(id, head, body) {
   });
 }
 
+/** What came of each observation of a landmark, and of the landmark itself, by time. @param {number} id */
+function showLife(id) {
+  const { residuals, outcomes } = run, moved = new Set(residuals.moved);
+  /** @type {any[][]} */
+  const lines = [];
+  residuals.id.forEach((/** @type {number} */ other, /** @type {number} */ i) => {
+    const weight = residuals.weight[i];
+    let what = weight === 0 ? 'rejected' : weight < 1 ? `used with weight ${weight}` : 'used';
+    if (moved.has(i)) what += ', believed moved';
+    if (other === id) lines.push([residuals.t[i], residuals.sigma[i], residuals.m[i], what]);
+  });
+  outcomes.id.forEach((/** @type {number} */ other, /** @type {number} */ i) => {
+    if (other === id) lines.push([outcomes.t[i], null, null, outcomes.what[i]]);
+  });
+  lines.sort((a, b) => a[0] - b[0]);
+  const section = element('life');
+  section.hidden = false;
+  const left_out = residuals.left_out ? '; of a long run some residuals are left out' : '';
+  /** @type {HTMLElement} */ (section.querySelector('h2')).textContent = `Landmark ${id}${left_out}`;
+  const table = document.createElement('table');
+  table.id = 'life-table';
+  /** @type {HTMLElement} */ (section.querySelector('table')).replaceWith(table);
+  fillTable('life-table', ['time [s]', 'residual [σ]', 'residual [m]', 'what came of it'], lines);
+  section.scrollIntoView({ behavior: 'smooth', block: 'nearest' });
+}
+
 function write() {
   document.title = run.title;
   element('title').textContent = run.title;
@@ -377,6 +407,12 @@ function write() {
   element('map-note').textContent = run.path.true_xyz ? 'The estimate as it was at each moment; its colour is the distance from the truth, aligned with the whole run.' : 'The estimate as it was at each moment. The recording holds no truth to compare it with.';
   if (run.errors.bound_m.some((/** @type {number|null} */ b) => b !== null)) element('map-note').textContent += ' Ellipses hold 95 %; they count from the first pose, from where everything is mapped.';
   fillTable('landmarks', ['id', 'observed', 'rejected', 'down-weighted', 'believed moved', 'residual RMS [m]', 'residual RMS [σ]', 'stated σ [m]', 'error [m]'], run.landmarks);
+  document.querySelectorAll('#landmarks tbody tr').forEach((row, n) => {
+    const cell = row.children[0], button = document.createElement('button');
+    button.textContent = cell.textContent;
+    button.addEventListener('click', () => showLife(run.landmarks[n][0]));
+    cell.replaceChildren(button);
+  });
   fillTable('figures', [], run.figures);
   fillTable('settings', ['name', 'value', 'default'], run.settings);
   fillTable('versions', [], run.versions);
