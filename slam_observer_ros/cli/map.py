@@ -11,12 +11,12 @@ from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.options import named, named_path
 from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.known_map.map_alignment import Likeness
 from slam_observer_ros.known_map.map_check import (
     look_around,
     Looks,
     place_for_another,
     symmetries,
-    Symmetry,
 )
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.known_map.map_import import import_map, LENGTHS, TAG_AXES
@@ -190,7 +190,7 @@ def _values(looks: Looks, in_space: bool) -> dict[str, str]:
     return values
 
 
-def _symmetry(same: list[Symmetry]) -> str:
+def _symmetry(same: list[Likeness]) -> str:
     """Return how the map may be turned and look the same."""
     if not same:
         return 'not when turned'

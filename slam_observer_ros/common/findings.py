@@ -421,6 +421,23 @@ KINDS = {
         'for exact',
         'use two_d_mode: true for a robot on a floor',
     ),
+    'skipped_file': Kind(
+        Level.WARNING,
+        '{name} of the folder of maps is skipped, as it {why}',
+        'keep other files elsewhere',
+    ),
+    'equal_maps': Kind(
+        Level.WARNING,
+        'the maps {other} and {name} say the same, so {other} is used for both',
+        'keep one of the two in the folder',
+    ),
+    'alike_maps': Kind(
+        Level.WARNING,
+        'of the maps {other} and {name}, {count} landmarks are the same{moved}: a robot that sees '
+        'only these fits in both',
+        'take one of the two out of the folder, or, if they are two places, give each ids that '
+        'the other one has not',
+    ),
     'symmetric_map': Kind(
         Level.WARNING,
         'the map{name} is the same turned by {turn_deg:.0f}°{but}: without ids or a start pose '

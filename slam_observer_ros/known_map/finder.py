@@ -14,7 +14,8 @@ from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.known_map.constellation import find_places, MAX_LOOKS
 from slam_observer_ros.known_map.landmark_map import LandmarkMap, MappedLandmarks
-from slam_observer_ros.known_map.map_check import place_for_another, symmetries
+from slam_observer_ros.known_map.map_alignment import AlikeMaps, Likeness, likeness_by_ids
+from slam_observer_ros.known_map.map_check import place_for_another, symmetries, turns_onto
 from slam_observer_ros.known_map.places import (
     Anywhere,
     Constellation,
@@ -62,6 +63,14 @@ def warn_of_symmetry(loaded: LandmarkMap, name: str) -> None:
     logger.warning('%s', finding)
 
 
+def _likeness(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
+    """Return how a map is to be moved to look as another, if their ids have not said so."""
+    if likeness_by_ids(known, other) is not None:
+        return None
+    found = turns_onto(known, other)
+    return max(found, key=lambda each: int(each.is_same.sum()), default=None)
+
+
 class Finder:
     """Searches maps for the place where an estimate in a frame of its own is.
 
@@ -77,7 +86,8 @@ class Finder:
     ) -> None:
         self._maps = [_SearchedMap(known, state, rough) for known in maps]
         self._ids = np.concatenate([known.ids for known in maps])
-        self._has_warned = False  # of symmetries, which only points without ids suffer from
+        self._has_warned = False  # of maps that look alike, to points without ids
+        self.alike = AlikeMaps([], _likeness)
         self._searched: tuple[int, int] | None = None
         self.places: Places | None = None  # that fit, when it was searched last
 
@@ -109,9 +119,10 @@ class Finder:
         has_no_id = is_automatic(landmarks.ids) & (landmarks.counts >= MIN_COUNT)
         if has_no_id.any() and not self._has_warned:
             self._has_warned = True
-            for known in self._maps:
-                name = known.loaded.name if len(self._maps) > 1 else ''
-                warn_of_symmetry(known.loaded, name)
+            maps = [known.loaded for known in self._maps]
+            for loaded in maps:
+                warn_of_symmetry(loaded, loaded.name if len(maps) > 1 else '')
+            self.alike = AlikeMaps(maps, _likeness)
         rows = np.flatnonzero(has_no_id | np.isin(landmarks.ids, self._ids))
         are_ids_enough = len(self._maps) == 1 and not has_no_id.any()
         if are_ids_enough or len(rows) <= state.axes.point:

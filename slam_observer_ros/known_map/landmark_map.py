@@ -15,6 +15,15 @@ from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks, part_of_joint, tags_among
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 
+SAME_M = 0.2
+"""How far landmarks may be from each other that look the same from a place that looks the same."""
+
+SAME_SHARE = 0.9
+"""Share of the landmarks that are where others are, in a map that looks the same when moved."""
+
+ROUNDED_M = 1e-3
+"""By how much positions differ that somebody wrote down in millimetres."""
+
 MAX_NUMBER = 1e12
 """Metres; nothing larger is meant seriously, and its square still has all digits."""
 
@@ -83,6 +92,35 @@ class LandmarkMap:
         if self.covariances is not None:
             return limited(self.covariances, np.full(3, MAX_DEVIATION))
         return np.tile(sigma_m**2 * np.eye(3), (len(self.ids), 1, 1))
+
+    def says_the_same(self, other: LandmarkMap) -> bool:
+        """Return whether another map has the same landmarks, where this one says that they are.
+
+        That is within three standard deviations of the difference, and not more than SAME_M.
+        """
+        if self.frame_id != other.frame_id or len(self.ids) != len(other.ids):
+            return False
+        order, others = np.argsort(self.ids), np.argsort(other.ids)
+        if (self.ids[order] != other.ids[others]).any():
+            return False
+        variances = self.covariances_or(ROUNDED_M)[order] + other.covariances_or(ROUNDED_M)[others]
+        deviations = np.sqrt(np.diagonal(variances, axis1=1, axis2=2)) + ROUNDED_M
+        off_m = np.abs(self.world_points[order] - other.world_points[others])
+        are_there = (off_m <= np.minimum(3.0 * deviations, SAME_M)).all()
+        return bool(are_there) and self._turns_as(other, order, others)
+
+    def _turns_as(self, other: LandmarkMap, order: IntArray, others: IntArray) -> bool:
+        """Return whether tags (n,) of two maps are turned alike, within their sigmas."""
+        if self.orientations is None or other.orientations is None:
+            return self.orientations is other.orientations
+        R, R_other = self.orientations[order], other.orientations[others]
+        # Points, whose matrix is zero, only differ from tags.
+        off_rad = np.sqrt(0.5 * np.square(R - R_other).sum(axis=(1, 2)))
+        sigmas = np.zeros(len(order))
+        for each, rows in ((self, order), (other, others)):
+            if each.orientation_sigmas is not None:
+                sigmas = np.hypot(sigmas, each.orientation_sigmas[rows])
+        return bool((off_rad <= 3.0 * sigmas + ROUNDED_M).all())
 
     def landmarks_in(self, T: FloatArray, sigma_m: float) -> KnownLandmarks:
         """Return the landmarks with covariances, or :meth:`covariances_or`, in another frame.

@@ -15,7 +15,12 @@ from slam_observer_ros.common.types import FloatArray, is_automatic
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_alignment import pose_by_tag, TagPose
+from slam_observer_ros.known_map.map_alignment import (
+    AlikeMaps,
+    likeness_by_ids,
+    pose_by_tag,
+    TagPose,
+)
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
 from slam_observer_ros.state.state import State
 
@@ -67,6 +72,7 @@ class Localiser:
     def __init__(self) -> None:
         self.maps: list[LandmarkMap] = []  # the robot is in one of them
         self.loaded: LandmarkMap | None = None  # that one, once it is known
+        self._alike = AlikeMaps([], likeness_by_ids)
         self.is_localised = True  # in the final frame: always, unless a map was loaded
         self.counts: Counter[str] = Counter()  # 'not_localised' observations, poses 'lost'
         self._trial: PoseTrial | None = None
@@ -84,6 +90,7 @@ class Localiser:
         self.maps = [known.flattened() if two_d_mode else known for known in maps]
         if any(known.is_planar for known in maps) and not two_d_mode:
             logger.warning('%s', found('flat_map'))
+        self._alike = AlikeMaps(self.maps, likeness_by_ids)
         self._refused = set()
         self._search_again()
 
@@ -203,6 +210,10 @@ class Localiser:
         places = [place for place in self.places if place.share > LEAST_SHARE]
         if not places:
             return found('no_place', where=self._where)
+        maps = [place.map_index for place in places]
+        looks = AlikeMaps([], likeness_by_ids) if self._finder is None else self._finder.alike
+        if alike := self._alike.among(maps) or looks.among(maps):
+            return alike
         fits = ' and '.join(self._name(place, A) for place in places[:MAX_NAMED])
         if len(places) > MAX_NAMED:
             fits += f' and {len(places) - MAX_NAMED} more'
@@ -233,7 +244,9 @@ class Localiser:
             )
         elif not self._said_problem and len([p for p in self.places if p.share > LEAST_SHARE]) > 1:
             self._said_problem = True
-            logger.warning('%s', self.problem(state.observer.A))
+            problem = self.problem(state.observer.A)
+            if problem is not None and problem.kind == 'ambiguous_place':  # others are known
+                logger.warning('%s', problem)
 
     def enter(self, state: State) -> bool:
         """Move an estimate into the frame of a loaded map, if landmarks with ids suffice."""

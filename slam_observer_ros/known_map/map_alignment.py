@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from itertools import combinations
+import logging
 
 import numpy as np
 
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import definite_inverse, solve_symmetric
 from slam_observer_ros.geometry.se3 import rigid_alignment
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.landmark_map import LandmarkMap, SAME_M, SAME_SHARE
 from slam_observer_ros.observer.known_landmarks import anchor, JITTER_M2, KnownLandmarks
 from slam_observer_ros.state.state import State
+
+logger = logging.getLogger(__name__)
 
 MAX_TURN_STD_RAD = 0.2
 """Standard deviation about any axis beyond which landmarks don't determine the attitude.
@@ -120,6 +126,86 @@ def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float,
     left = Q @ r.ravel()
     variances = np.maximum(np.diagonal(Q), 1e-6 * np.diagonal(weights))
     return float(r.ravel() @ left), np.sum((left**2 / variances).reshape(r.shape), axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likeness:
+    """A motion after which landmarks of a map are nearly where those of a map are."""
+
+    transform: FloatArray  # (4, 4)
+    is_same: BoolArray  # (n,) which landmarks are then where others are
+
+    @property
+    def turn_deg(self) -> float:
+        """By how much it turns, degrees, 0 to 180."""
+        return float(np.rad2deg(np.linalg.norm(so3.log(self.transform[:3, :3]))))
+
+    @property
+    def moved(self) -> str:
+        """How it moves the map, in words that follow a comma; empty if it does not."""
+        turn_deg, shift_m = self.turn_deg, self.transform[:3, 3]
+        x, y, z = shift_m.tolist()
+        # Less is no other place, and may come of the errors of a few landmarks.
+        is_turned, is_shifted = turn_deg > LEAST_TURN_DEG, np.linalg.norm(shift_m) > SAME_M
+        turned = f', turned by {turn_deg:.0f}°' if is_turned else ''
+        joint = ' and' if is_turned else ','
+        return turned + (f'{joint} shifted by ({x:.1f}, {y:.1f}, {z:.1f}) m' if is_shifted else '')
+
+
+LEAST_TURN_DEG = 6.0
+"""Least turn about the vertical that makes another place."""
+
+
+def likeness_by_ids(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
+    """Return how a map is to be moved to be another, or a part of it, by their ids; or None."""
+    _, own, others = np.intersect1d(known.ids, other.ids, return_indices=True)
+    smaller = min(len(known.ids), len(other.ids))
+    needed = max(SAME_SHARE * smaller, LEAST_SAME)
+    points, targets = known.world_points[own], other.world_points[others]
+    is_same = np.ones(len(own), dtype=np.bool_)
+    while np.count_nonzero(is_same) >= needed:
+        T = rigid_alignment(points[is_same], targets[is_same])
+        off_m = np.linalg.norm(se3.transform(T, points) - targets, axis=1)
+        worst_m = float(off_m[is_same].max())
+        if worst_m <= SAME_M:
+            are_same = np.zeros(len(known.ids), dtype=np.bool_)
+            are_same[own[off_m <= SAME_M]] = True
+            return Likeness(T, are_same)
+        # Some that were moved shift all others, but by less than they are off themselves.
+        is_same &= off_m <= 0.5 * worst_m
+    return None
+
+
+LEAST_SAME = 3
+"""Landmarks that show that two maps are one place: of two alone only the distance has to fit."""
+
+
+class AlikeMaps:
+    """Which of several maps are another one, moved; of each that is logged once."""
+
+    def __init__(
+        self,
+        maps: Sequence[LandmarkMap],
+        likeness: Callable[[LandmarkMap, LandmarkMap], Likeness | None],
+    ) -> None:
+        self._findings: dict[tuple[int, int], Finding] = {}
+        for (i, first), (j, second) in combinations(enumerate(maps), 2):
+            if (alike := likeness(first, second)) is None:
+                continue
+            self._findings[i, j] = finding = found(
+                'alike_maps',
+                other=first.name,
+                name=second.name,
+                count=np.count_nonzero(alike.is_same),
+                moved=alike.moved,
+            )
+            if not any((k, j) in self._findings for k in range(i)):
+                logger.warning('%s', finding)
+
+    def among(self, maps: Iterable[int]) -> Finding | None:
+        """Return what is to be said of two of these maps, by number, that are alike; or None."""
+        pairs = combinations(sorted(set(maps)), 2)
+        return next((self._findings[pair] for pair in pairs if pair in self._findings), None)
 
 
 SIGHTINGS = 2

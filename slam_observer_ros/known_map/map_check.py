@@ -13,33 +13,20 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.known_map.constellation import find_places
-from slam_observer_ros.known_map.landmark_map import LandmarkMap, MappedLandmarks
+from slam_observer_ros.known_map.landmark_map import (
+    LandmarkMap,
+    MappedLandmarks,
+    SAME_M,
+    SAME_SHARE,
+)
+from slam_observer_ros.known_map.map_alignment import LEAST_SAME, LEAST_TURN_DEG, Likeness
 from slam_observer_ros.known_map.places import Anywhere, Constellation
 
-SAME_M = 0.2
-"""How far landmarks may be from each other that look the same from a place that looks the same."""
-
-SAME_SHARE = 0.9
-"""Share of the landmarks that are where others are, in a map that looks the same when turned."""
-
-LEAST_TURN_RAD = 0.1
+LEAST_TURN_RAD = math.radians(LEAST_TURN_DEG)
 MAX_ALIKE = 64
 MAX_LOOKS, MAX_SEEN = 600, 12
 CELLS = 40
 """Along the longer side of a map, free places for one more landmark."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Symmetry:
-    """A turn about the vertical after which a map looks nearly the same."""
-
-    transform: FloatArray  # (4, 4)
-    is_same: BoolArray  # (n,) which landmarks are then where others were
-
-    @property
-    def turn_deg(self) -> float:
-        """By how much it is turned, degrees, 0 to 180."""
-        return abs(math.degrees(math.atan2(self.transform[1, 0], self.transform[0, 0])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,59 +40,72 @@ class Looks:
     is_found: BoolArray  # (q,) is it sure enough
 
 
-def symmetries(known: LandmarkMap) -> list[Symmetry]:
+def symmetries(known: LandmarkMap) -> list[Likeness]:
     """Return the turns about the vertical after which a map looks the same, the best first.
 
-    Of turns that are as good the smallest is the first, as it makes the others. Any of these
-    leaves the centre of the landmarks where it is, and takes the outermost one to one as far from
-    there.
+    Of turns that are as good the smallest is the first, as it makes the others.
+    """
+    found = turns_onto(known, known)
+    turned = [each for each in found if each.turn_deg > LEAST_TURN_DEG]
+    return sorted(turned, key=lambda each: (-int(each.is_same.sum()), round(each.turn_deg)))
+
+
+def turns_onto(known: LandmarkMap, other: LandmarkMap) -> list[Likeness]:
+    """Return the turns about the vertical after which a map looks as another, whatever its ids.
+
+    Any of these takes the centre of the landmarks to the other centre, and the outermost landmark
+    to one as far from there.
     """
     from scipy.spatial import cKDTree
 
-    points = known.world_points
-    if len(points) < 3:
+    points, others = known.world_points, other.world_points
+    sizes = sorted((len(points), len(others)))
+    if sizes[0] < LEAST_SAME or sizes[0] < SAME_SHARE * sizes[1]:
         return []
-    from_centre = points - points.mean(axis=0)
-    radii_m, angles = (
-        np.linalg.norm(from_centre[:, :2], axis=1),
-        np.arctan2(from_centre[:, 1], from_centre[:, 0]),
-    )
-    first, tree = int(np.argmax(radii_m)), cKDTree(points)
+    radii_m, angles = _from_centre(points)
+    other_radii_m, other_angles = _from_centre(others)
+    first, tree = int(np.argmax(radii_m)), cKDTree(others)
     tolerance_m = SAME_M + 2.0 * radii_m[first] * (1.0 - SAME_SHARE)
-    off_m = np.abs(radii_m - radii_m[first])
+    off_m = np.abs(other_radii_m - radii_m[first])
     alike = np.argsort(off_m)[: min(MAX_ALIKE, int(np.count_nonzero(off_m < tolerance_m)))]
-    found: list[Symmetry] = []
-    for angle in angles[alike] - angles[first]:
-        if abs(math.remainder(angle, 2.0 * math.pi)) < LEAST_TURN_RAD:
-            continue
-        symmetry = _fitted(points, tree, angle)
-        others = [np.eye(4), *(other.transform for other in found)]
-        is_new = all(_turn_rad(symmetry.transform, other) > LEAST_TURN_RAD for other in others)
-        if is_new and symmetry.is_same.mean() >= SAME_SHARE:
-            found.append(symmetry)
-    return sorted(found, key=lambda each: (-int(each.is_same.sum()), round(each.turn_deg)))
+    found: list[Likeness] = []
+    for angle in other_angles[alike] - angles[first]:
+        likeness = _fitted(points, others, tree, angle)
+        T = likeness.transform
+        is_new = all(_turn_rad(T, each.transform) > LEAST_TURN_RAD for each in found)
+        if is_new and likeness.is_same.mean() >= SAME_SHARE:
+            found.append(likeness)
+    return found
+
+
+def _from_centre(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far points are from their centre, metres, and in which direction, rad."""
+    offsets = points - points.mean(axis=0)
+    return np.linalg.norm(offsets[:, :2], axis=1), np.arctan2(offsets[:, 1], offsets[:, 0])
 
 
 def _turn_rad(T: FloatArray, other: FloatArray) -> float:
     return float(np.linalg.norm(so3.log(T[:3, :3] @ other[:3, :3].T)))
 
 
-def _fitted(points: FloatArray, tree: Any, angle: float) -> Symmetry:
+def _fitted(points: FloatArray, others: FloatArray, tree: Any, angle: float) -> Likeness:
     """Return the turn by about an angle that fits best, the nearest landmarks being the same."""
-    centre = points.mean(axis=0)
+    centre, other_centre = points.mean(axis=0), others.mean(axis=0)
     R = so3.exp(np.array([0.0, 0.0, angle]))
-    T = se3.pose(R, centre - R @ centre)
+    T = se3.pose(R, other_centre - R @ centre)
     flat = np.array([1.0, 1.0, 0.0])
     for tolerance_m in (10.0 * SAME_M, 3.0 * SAME_M, SAME_M):
         distances_m, near = tree.query(se3.transform(T, points))
         is_same = distances_m <= tolerance_m
         if is_same.mean() < SAME_SHARE:
             break
-        T = rigid_alignment(points[is_same] * flat, points[near[is_same]] * flat)
-    return Symmetry(T, np.asarray(is_same))
+        z_m = (others[near[is_same]] - points[is_same])[:, 2].mean()
+        T = rigid_alignment(points[is_same] * flat, others[near[is_same]] * flat)
+        T[2, 3] = z_m
+    return Likeness(T, np.asarray(is_same))
 
 
-def place_for_another(known: LandmarkMap, symmetry: Symmetry) -> FloatArray:
+def place_for_another(known: LandmarkMap, symmetry: Likeness) -> FloatArray:
     """Return where (3,) one more landmark shows best which way round the map is, metres.
 
     Among free places in the map, that which is furthest from all landmarks, from where these would

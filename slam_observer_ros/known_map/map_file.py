@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 import dataclasses
+import logging
 from pathlib import Path
 import re
 import tempfile
@@ -38,8 +39,10 @@ from slam_observer_ros.common.files import (
     keep_copy,
     load_yaml,
     plain_value,
+    read_text,
     unfinished_file,
 )
+from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
@@ -47,6 +50,8 @@ from slam_observer_ros.geometry.matrices import are_covariances
 from slam_observer_ros.known_map import map_correlations
 from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
 from slam_observer_ros.settings.estimator_settings import Settings
+
+logger = logging.getLogger(__name__)
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
@@ -129,6 +134,10 @@ def check_writable(path: Path) -> None:
         raise MapError(f"can't write map {path}: {reason}") from error
 
 
+class OtherFileError(MapError):
+    """A file that is no map of landmarks, nor meant to be one."""
+
+
 def read_map(path: Path) -> LandmarkMap:
     """Read a map, strictly.
 
@@ -141,19 +150,43 @@ def read_map(path: Path) -> LandmarkMap:
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error
     except YamlError as error:
-        raise MapError(f'map {path} is not valid YAML: {error}') from error
+        kind = MapError if FORMAT in read_text(path) else OtherFileError
+        raise kind(f'map {path} is not valid YAML: {error}') from error
     try:
         return dataclasses.replace(_parse(content), name=path.stem)
     except MapError as error:
-        raise MapError(f'map {path}: {error}') from error
+        raise type(error)(f'map {path}: {error}') from error
 
 
 def read_maps(path: Path) -> list[LandmarkMap]:
     """Read a map, or all maps of a folder: the robot is in one of them.
 
+    In a folder files that are no maps are skipped, and of maps that say the same one is taken,
+    with a warning.
+
     Raise :exc:`MapError` as :func:`read_map` does, or if there is none in the folder.
     """
-    return [read_map(file) for file in map_files(path)]
+    if not path.is_dir():
+        return [read_map(path)]
+    files, maps = map_files(path), list[LandmarkMap]()
+    stems = Counter(file.stem for file in files)
+    for file in files:
+        try:
+            known = read_map(file)
+        except OtherFileError as error:
+            why = str(error).removeprefix(f'map {file}').removeprefix(': it').strip()
+            logger.warning('%s', found('skipped_file', name=file.name, why=why))
+            continue
+        if stems[file.stem] > 1:
+            known = dataclasses.replace(known, name=file.name)
+        if twins := [each for each in maps if each.says_the_same(known)]:
+            finding = found('equal_maps', name=known.name, other=twins[0].name)
+            logger.warning('%s', finding)
+            continue
+        maps.append(known)
+    if not maps:
+        raise MapError(f'there is no map of landmarks in the folder {path}')
+    return maps
 
 
 def map_files(path: Path) -> list[Path]:
@@ -161,7 +194,11 @@ def map_files(path: Path) -> list[Path]:
     try:
         if not path.is_dir():
             return [path]
-        files = sorted(file for file in path.iterdir() if file.suffix in ('.yaml', '.yml'))
+        files = sorted(
+            file
+            for file in path.iterdir()
+            if file.suffix in ('.yaml', '.yml') and not file.is_dir()
+        )
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error
     if not files:
@@ -209,9 +246,10 @@ def _on_one_line(landmark: Mapping[str, Any]) -> str:
 
 def _parse(content: Any) -> LandmarkMap:
     if isinstance(content, dict) and {'image', 'resolution'} <= content.keys():
-        raise MapError("it is an occupancy grid, as map_server's, and no map of landmarks")
-    is_map = isinstance(content, dict) and content.get('format') == FORMAT
-    _expect(is_map, f"it has no line 'format: {FORMAT}'; slam-observer map convert makes maps")
+        raise OtherFileError("it is an occupancy grid, as map_server's, and no map of landmarks")
+    if not isinstance(content, dict) or content.get('format') != FORMAT:
+        reason = f"it has no line 'format: {FORMAT}'; slam-observer map convert makes maps"
+        raise OtherFileError(reason)
     version = content.get('version')
     if version != FORMAT_VERSION:
         raise MapError(f'it has version {shown(version)}; this program reads {FORMAT_VERSION}')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import os
 from pathlib import Path
 
@@ -183,12 +184,65 @@ def test_a_folder_has_the_maps_of_several_halls(tmp_path):
     maps = read_maps(tmp_path)
     assert [(known.name, len(known.ids)) for known in maps] == [('hall_a', 3), ('hall_b', 4)]
     assert [known.name for known in read_maps(tmp_path / 'hall_b.yaml')] == ['hall_b']
-    (tmp_path / 'grid.yaml').write_text('image: hall.pgm\nresolution: 0.05\n')
-    with pytest.raises(MapError, match=r'map .*grid\.yaml: it is an occupancy grid'):
-        read_maps(tmp_path)
     (tmp_path / 'empty').mkdir()
     with pytest.raises(MapError, match=r'there is no map, a file \*\.yaml, in the folder .*empty'):
         read_maps(tmp_path / 'empty')
+
+
+NO_MAPS = {
+    'grid': ('image: hall.pgm\nresolution: 0.05\n', 'it is an occupancy grid'),
+    'params': ('observer_node:\n  ros__parameters:\n    two_d_mode: true\n', 'it has no line'),
+    'camera': ('%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: 3\n', 'is not valid YAML'),
+    'empty': ('', 'it has no line'),
+    '._hall': ('\x00\x05\x16\x07', 'is not valid YAML'),
+}
+
+
+@pytest.mark.parametrize('name', NO_MAPS)
+def test_a_file_of_a_folder_that_is_no_map_is_skipped_and_named(name, tmp_path, caplog):
+    content, why = NO_MAPS[name]
+    (tmp_path / f'{name}.yaml').write_text(content)
+    with pytest.raises(MapError, match='there is no map of landmarks in the folder'):
+        read_maps(tmp_path)
+    with pytest.raises(MapError, match=why):
+        read_maps(tmp_path / f'{name}.yaml')
+    caplog.clear()
+    write_map(tmp_path / 'hall.yaml', a_map(), Settings())
+    assert [known.name for known in read_maps(tmp_path)] == ['hall']
+    why = f'it {why.removeprefix("it ")}'
+    assert f'{name}.yaml of the folder of maps is skipped, as {why}' in ' '.join(caplog.messages)
+
+
+@pytest.mark.parametrize(
+    ('old', 'new'), [('position', 'possition'), ('version: 1', 'version: 7'), ('[', '{[')]
+)
+def test_a_map_of_a_folder_that_is_wrong_is_not_skipped(old, new, tmp_path):
+    write_map(tmp_path / 'a.yaml', a_map(), Settings())
+    (tmp_path / 'b.yaml').write_text(changed(old, new))
+    with pytest.raises(MapError, match=r'map .*b\.yaml'):
+        read_maps(tmp_path)
+
+
+def test_of_maps_that_say_the_same_one_is_taken_and_it_is_said_once(tmp_path, caplog):
+    known = replace(a_map(5), covariances=np.tile(1e-4 * np.eye(3), (5, 1, 1)))
+    write_map(tmp_path / 'hall.yaml', known, Settings())
+    (tmp_path / 'hall_copy.yaml').write_bytes((tmp_path / 'hall.yaml').read_bytes())
+    write_map(tmp_path / 'hall.yml', known.select(np.arange(5)[::-1]), None)  # in another order
+    later = replace(known, world_points=known.world_points + 0.01)
+    write_map(tmp_path / 'hall_later.yaml', later, Settings())
+    moved = replace(known, world_points=known.world_points + [3.0, 0.0, 0.0])
+    write_map(tmp_path / 'other.yaml', moved, Settings())
+    assert [each.name for each in read_maps(tmp_path)] == ['hall.yaml', 'other']
+    said = [text for text in caplog.messages if 'say the same' in text]
+    assert len(said) == 3
+    R = np.tile(np.eye(3), (5, 1, 1))
+    tags = replace(known, orientations=R, orientation_sigmas=np.ones(5))
+    assert tags.says_the_same(replace(tags, orientations=tags.orientations[::-1]))
+    assert not tags.says_the_same(known)
+    turned = replace(tags, orientations=-tags.orientations[:, ::-1])
+    exact = {'orientation_sigmas': np.full(5, 0.02)}
+    assert not replace(tags, **exact).says_the_same(replace(turned, **exact))
+    assert 'The maps hall.yaml and hall_copy say the same, so hall.yaml is used' in said[1]
 
 
 def changed(old, new):
