@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.cli.outputs import (
@@ -15,7 +17,14 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
-from slam_observer_ros.recording.data_sets import load_mrclam, load_starry_night
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_file import write_map
+from slam_observer_ros.recording.data_sets import (
+    load_mrclam,
+    load_plaza,
+    load_starry_night,
+    MEASURES,
+)
 from slam_observer_ros.recording.graph_files import load_graph
 from slam_observer_ros.recording.writer import DataSet, write_data_set
 
@@ -50,9 +59,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     mrclam.add_argument(
         '--robot', type=int, required=True, metavar='N', help='which robot, from 1 to 5'
     )
-    mrclam.set_defaults(
-        run=_run, file=None, truth=None, load=lambda args: load_mrclam(args.folder, args.robot)
+    mrclam.add_argument(
+        '--measure',
+        choices=tuple(MEASURES),
+        default='point',
+        help='leave only directions or distances of the landmarks (default point: both)',
     )
+    mrclam.set_defaults(
+        run=_run, load=lambda args: load_mrclam(args.folder, args.robot, args.measure)
+    )
+    plaza = data_sets.add_parser(
+        'plaza',
+        help='a mower among radios that give distances: plazaN_dr.csv, _td, _gt and _tl',
+        description='Columns below a line of their names, N being the run: plazaN_dr.csv, the way '
+        'since the row before: t (s), forward (m), turn (rad); plazaN_td.csv, distances: t, '
+        'sender, anchor, range (m); and, if they are there, plazaN_gt.csv, true poses: t, x, y, '
+        'yaw, and plazaN_tl.csv, radios: anchor, x, y. OUT.yaml is made, too: the map of these.',
+    )
+    plaza.add_argument('folder', type=named_path, metavar='FOLDER', help='of these files')
+    plaza.add_argument('--run', type=int, required=True, metavar='N', dest='number', help='1 or 2')
+    plaza.set_defaults(run=_run_plaza)
     graph = data_sets.add_parser(
         'graph', help='poses and points in the plane, in the text formats of iSAM and g2o'
     )
@@ -64,7 +90,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='the same graph with true, or the best, values',
     )
     graph.set_defaults(run=_run_graph, load=lambda args: load_graph(args.file, args.truth))
-    for data_set in (starry_night, mrclam, graph):
+    for data_set in (starry_night, mrclam, plaza, graph):
         data_set.add_argument(
             'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
         )
@@ -75,7 +101,7 @@ def _run_graph(args: argparse.Namespace) -> None:
     """Write a graph, and beside it the parameters without which its steps mean something else."""
     parameters: Path = args.output.with_suffix('.yaml')
     _check(args, parameters)
-    rows = _written(args)
+    rows = _written(args, args.load(args))
     try:
         with unfinished_file(parameters) as file:
             file.write(GRAPH_PARAMETERS)
@@ -85,22 +111,46 @@ def _run_graph(args: argparse.Namespace) -> None:
     print_table(str(args.output), rows)
 
 
+SURVEY_M = 0.05
+"""Standard deviation of coordinates of Plaza's radios, which were surveyed by GPS."""
+
+
+def _run_plaza(args: argparse.Namespace) -> None:
+    """Write a run, beside it the survey of its radios, and say where the mower began."""
+    survey: Path = args.output.with_suffix('.yaml')
+    _check(args, survey)
+    data_set = load_plaza(args.folder, args.number)
+    rows = _written(args, data_set)
+    anchors, count = data_set.landmarks, len(data_set.landmarks.ids)
+    if count and len(data_set.true_poses):
+        covariances = np.tile(SURVEY_M**2 * np.eye(3), (count, 1, 1))
+        points, never = anchors.world_points, np.zeros(count, dtype=np.int64)
+        write_map(survey, LandmarkMap(anchors.ids, points, covariances, never), None)
+        start = data_set.true_poses[0]
+        yaw = float(np.arctan2(start[1, 0], start[0, 0]))
+        rows['survey, and where it begins'] = (
+            f'--load-map {survey} --set set_initial_pose=true '
+            f'--set initial_position=[{start[0, 3]:.3f},{start[1, 3]:.3f},0.0] '
+            f'--set initial_yaw={yaw:.4f} '
+        )
+    print_table(str(args.output), rows)
+
+
 def _run(args: argparse.Namespace) -> None:
     _check(args)
-    print_table(str(args.output), _written(args))
+    print_table(str(args.output), _written(args, args.load(args)))
 
 
-def _check(args: argparse.Namespace, parameters: Path | None = None) -> None:
-    given = (vars(args).get(name) for name in ('file', 'truth'))  # mrclam has a folder instead
+def _check(args: argparse.Namespace, beside: Path | None = None) -> None:
+    given = (vars(args).get(name) for name in ('file', 'truth'))  # others have a folder instead
     read = [file for file in given if file is not None]
-    outputs = {'OUT.mcap': args.output, 'the file of parameters': parameters}
+    outputs = {'OUT.mcap': args.output, 'the file beside it': beside}
     check_inputs_are_kept(outputs, {'the data set': read})
     check_outputs(outputs.values(), args.force)
 
 
-def _written(args: argparse.Namespace) -> dict[str, str]:
+def _written(args: argparse.Namespace, data_set: DataSet) -> dict[str, str]:
     """Write a recording; return what there is to say of it."""
-    data_set: DataSet = args.load(args)
     write_data_set(data_set, args.output, args.force)
     rows = {
         'velocities': str(len(data_set.velocity_stamps_ns)),

@@ -475,6 +475,11 @@ KINDS = {
         'points without an id are not used by {gains} gains',
         'only riccati gains use them',
     ),
+    'half_point_without_id': Kind(
+        Level.WARNING,
+        'not used: {count} bearings or ranges alone of an observation, which have no id',
+        'let the driver say of which landmark each is: by where it is none is recognised',
+    ),
     'bad_point': Kind(
         Level.WARNING,
         'not used: {count} points of an observation of which a covariance, velocity or '

@@ -27,6 +27,7 @@ from slam_observer_ros.events import (
     IMPOSSIBLE_ID,
     MAX_ID,
     ObservationEvent,
+    POINT,
     UNKNOWN_ID,
     VelocityBlock,
     VelocityEvent,
@@ -393,6 +394,10 @@ def usable_points(
         counts.note(Reason.REPEATED_ID, event.ids[repeated], event.stamp_ns)
         event = event.select(~repeated)
     unknown = event.ids == UNKNOWN_ID
+    if event.kinds is not None and (halves := unknown & (event.kinds != POINT)).any():
+        warnings.warn('half_point_without_id', count=int(np.sum(halves)))
+        counts.note(Reason.NO_ID, event.ids[halves], event.stamp_ns)
+        event, unknown = event.select(~halves), unknown[~halves]
     can_weigh = gains.errors is not None
     if not can_weigh and np.count_nonzero(unknown):
         warnings.warn('unknown_id', gains=settings.gains)

@@ -121,11 +121,16 @@ class CdrReader:
         start = self._take(size, 1)
         return memoryview(self._raw)[start : start + size]
 
-    def finish(self) -> None:
-        """Check that the message ends here, but for padding: else it is of another type."""
+    @property
+    def bytes_left(self) -> int:
+        """How many bytes are still to be read, but for padding: of a field of newer releases."""
         left = len(self._raw) - self._position
-        if left > MAX_PADDING_BYTES:
-            raise MessageError(f'{left} bytes too long: is it of another type?')
+        return left if left > MAX_PADDING_BYTES else 0
+
+    def finish(self) -> None:
+        """Check that the message ends here: else it is of another type."""
+        if self.bytes_left:
+            raise MessageError(f'{self.bytes_left} bytes too long: is it of another type?')
 
 
 class CdrBlockReader(CdrReader):

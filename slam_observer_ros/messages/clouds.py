@@ -273,21 +273,35 @@ def _observation(stamp_ns: int, frame_id: str, records: Records) -> ObservationE
 
 
 def _ranges(stamp_ns: int, frame_id: str, records: Records) -> ObservationEvent:
-    """Return distances alone: in which direction the event has them says nothing."""
     names = [name for name in (RANGE_NAME, RANGE_VARIANCE_NAME) if name in _names(records)]
     columns = _columns(records, tuple(names))
-    points, covariances = np.zeros((len(columns), 3)), None
-    points[:, 0] = columns[:, 0]
-    if len(names) > 1 and columns[:, 1].any():
-        covariances = np.zeros((len(columns), 3, 3))
-        covariances[:, 0, 0] = columns[:, 1]
+    variances = columns[:, 1] if len(names) > 1 else None
+    return observed_ranges(frame_id, stamp_ns, _ids(records), columns[:, 0], variances)
+
+
+def observed_ranges(
+    frame_id: str,
+    stamp_ns: int,
+    ids: IntArray,
+    ranges: FloatArray,
+    variances: FloatArray | None = None,
+) -> ObservationEvent:
+    """Return distances alone (m,), in one frame; those that are none are left out.
+
+    In which direction the event has them says nothing. Variances (m,), m², are unknown where zero.
+    """
+    points, covariances = np.zeros((len(ids), 3)), None
+    points[:, 0] = ranges
+    if variances is not None and variances.any():
+        covariances = np.zeros((len(ids), 3, 3))
+        covariances[:, 0, 0] = variances
     event = ObservationEvent(
         stamp_ns,
-        _ids(records),
+        ids,
         points,
         covariances,
         sensor_frame=frame_id,
-        kinds=np.full(len(columns), RANGE),
+        kinds=np.full(len(ids), RANGE),
     )
     return event.select(is_measured(points) & (points[:, 0] > 0.0))
 

@@ -1,20 +1,22 @@
-"""Landmarks as packages give them: fiducials of ArUco and of Isaac ROS; Cartographer's, MRPT's.
+"""Landmarks as packages give them: fiducials, Cartographer's and MRPT's, ranges of radios.
 
 Messages are read from their bytes, so that none of the packages that define them is needed here.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from hashlib import sha256
+import re
 
 import numpy as np
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import AZIMUTH_RANGE, MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import CdrReader
-from slam_observer_ros.messages.clouds import is_measured
+from slam_observer_ros.messages.clouds import is_measured, observed_ranges
 from slam_observer_ros.messages.registry import reads
 
 _POSE = 7
@@ -302,3 +304,154 @@ def _polar_covariances(
     with np.errstate(over='ignore', invalid='ignore'):
         covariances: FloatArray = scaled @ scaled.swapaxes(1, 2)
     return covariances if np.isfinite(covariances).all() else None
+
+
+@reads(
+    'mrpt_msgs/msg/ObservationRangeBeacon',
+    role='landmarks',
+    package='mrpt_slam',
+    definition=(
+        'std_msgs/Header header\ngeometry_msgs/Pose sensor_pose_on_robot\n'
+        'float64 min_sensor_distance\nfloat64 max_sensor_distance\nfloat64 sensor_std_range\n'
+        'SingleRangeBeaconObservation[] sensed_data\n'
+        f'{NESTED}mrpt_msgs/SingleRangeBeaconObservation\nfloat64 range\nint32 id\n'
+    ),
+)
+def decode_range_beacon(reader: CdrReader) -> ObservationEvent:
+    """Read an mrpt_msgs/ObservationRangeBeacon, placed as an ObservationRangeBearing is."""
+    stamp_ns, frame_id = reader.header()
+    deviation_m = float(reader.float64(_POSE + 3)[-1])
+    sensed = [(reader.float64(1)[0], reader.int32()) for _ in range(reader.uint32())]
+    ids = np.array([number for _, number in sensed], dtype=np.int64)
+    ranges = np.array([value for value, _ in sensed])
+    variance = deviation_m * deviation_m if deviation_m > 0.0 else 0.0
+    variances = np.full(len(ids), variance if np.isfinite(variance) else 0.0)
+    return observed_ranges(frame_id, stamp_ns, _usable(ids), ranges, variances)
+
+
+def _register_linktrack(frame: str, own: str, own_numbers: int, node: str, angle: str) -> None:
+    """Read a frame of LinkTrack by the driver's package and by its port, which adds a header.
+
+    ``own`` are ``own_numbers`` fields of the receiver itself. The ids of nodes start again in each
+    role. The direction, if ``angle`` is measured, is in degrees from x towards y.
+    """
+    for package, header in (
+        ('nlink_parser', ''),
+        ('nlink_parser_ros2_interfaces', 'std_msgs/Header header\n'),
+    ):
+
+        @reads(
+            f'{package}/msg/{frame}',
+            role='landmarks',
+            package='LinkTrack',
+            definition=(
+                f'{header}uint8 role\nuint8 id\nuint32 local_time\nuint32 system_time\n'
+                f'float32 voltage\n{own}{node}[] nodes\n{NESTED}{package}/{node}\n'
+                f'uint8 role\nuint8 id\nfloat32 dis\n{angle}float32 fp_rssi\nfloat32 rx_rssi\n'
+            ),
+        )
+        def decode(reader: CdrReader, has_header: bool = bool(header)) -> ObservationEvent:
+            stamp_ns, frame_id = reader.header() if has_header else (reader.receive_ns, '')
+            for read in (reader.uint8, reader.uint8, reader.uint32, reader.uint32):
+                read()
+            reader.float32(1 + own_numbers)
+            seen = [
+                (reader.uint8(), reader.uint8(), *reader.float32(4 if angle else 3))
+                for _ in range(reader.uint32())
+            ]
+            nodes = np.array(seen).reshape(-1, 6 if angle else 5)
+            if angle:
+                nodes = nodes[is_measured(nodes[:, 2:4])]
+            ids, ranges = nodes[:, 1].astype(np.int64), nodes[:, 2]
+            event = observed_ranges(frame_id, stamp_ns, ids, ranges)
+            if not angle:
+                return event
+            turns = np.deg2rad(nodes[ranges > 0.0, 3])
+            directions = np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
+            points = np.linalg.norm(event.points, axis=1)[:, None] * directions
+            return replace(event, points=points, kinds=np.full(len(points), AZIMUTH_RANGE))
+
+
+_register_linktrack(
+    'LinktrackNodeframe2',
+    'float32[3] pos_3d\nfloat32[3] eop_3d\nfloat32[3] vel_3d\nfloat32[3] angle_3d\n'
+    'float32[4] quaternion\nfloat32[3] imu_gyro_3d\nfloat32[3] imu_acc_3d\n',
+    22,
+    'LinktrackNode2',
+    '',
+)
+_register_linktrack('LinktrackNodeframe3', '', 0, 'LinktrackNode2', '')
+_register_linktrack('LinktrackAoaNodeframe0', '', 0, 'LinktrackAoaNode0', 'float32 angle\n')
+
+
+@reads(
+    'marvelmind_ros2_msgs/msg/BeaconDistance',
+    'marvelmind_nav/msg/beacon_distance',
+    role='landmarks',
+    package='Marvelmind',
+    definition='uint8 address_hedge\nuint8 address_beacon\nfloat64 distance_m\n',
+)
+def decode_beacon_distance(reader: CdrReader) -> ObservationEvent:
+    """Read a BeaconDistance of marvelmind_ros2_msgs, or of ROS 1: one of a stationary beacon."""
+    reader.uint8()  # the mobile beacon
+    beacon = np.array([reader.uint8()], dtype=np.int64)
+    return observed_ranges('', reader.receive_ns, beacon, reader.float64(1))
+
+
+_GTEC_RADIO = (
+    'int32 max_noise\nint32 std_noise\nint32 first_path_amp1\nint32 first_path_amp2\n'
+    'int32 first_path_amp3\nint32 max_growth_cir\nint32 rx_pream_count\nint32 first_path\n'
+    'float64 channel\nint32 prf\nfloat64 datarate\nint32 preamble_length\nint32 pac_size\n'
+)
+_GTEC = {
+    'Ranging': 'int32 seq\nfloat64 rss\nfloat64 error_estimation\n',
+    'GenericRanging': 'int32 seq\nfloat64 rx_power\n',
+    'DWRanging': f'int32 rawrange\nint32 seq\n{_GTEC_RADIO}',
+    'UWBRanging': (
+        f'int32 rawrange\nint32 bias_correction\nint32 seq\n{_GTEC_RADIO}'
+        'float64 error_estimation\n'
+    ),
+}
+"""Fields behind the range, by type."""
+
+
+def _register_gtec(name: str, rest: str) -> None:
+    @reads(
+        f'gtec_msgs/msg/{name}',
+        role='landmarks',
+        package='GTEC',
+        definition=f'int16 anchor_id\nint16 tag_id\nint32 range\n{rest}',
+    )
+    def decode(reader: CdrReader) -> ObservationEvent:
+        """Read the distance of one anchor, whose message has millimetres."""
+        anchor = np.array([reader.uint16()], dtype=np.int64)  # as radios have 16 bits of it
+        reader.uint16()  # tag
+        ranges = np.array([reader.int32() / 1e3])
+        for field in rest.splitlines():
+            if field.startswith('int32'):
+                reader.int32()
+            else:
+                reader.float64(1)
+        return observed_ranges('', reader.receive_ns, anchor, ranges)
+
+
+for _name, _rest in _GTEC.items():
+    _register_gtec(_name, _rest)
+
+
+@reads('sensor_msgs/msg/Range', role='landmarks', is_ambiguous=True)
+def decode_range(reader: CdrReader) -> ObservationEvent:
+    """Read a sensor_msgs/Range of a landmark whose id is the number that ends the frame's name.
+
+    What is nearer or further than the sensor can measure is left out. Releases until Iron have no
+    variance.
+    """
+    stamp_ns, frame_id = reader.header()
+    reader.uint8()  # radiation
+    _, nearest, furthest, measured = reader.float32(4)
+    variances = reader.float32(1) if reader.bytes_left else None
+    number = re.search(r'\d{1,9}\Z', frame_id, re.ASCII)
+    seen = nearest <= measured <= furthest
+    ids = np.array([UNKNOWN_ID if number is None else int(number[0])], dtype=np.int64)
+    ranges = np.array([measured if seen else np.nan])
+    return observed_ranges(frame_id, stamp_ns, ids, ranges, variances)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import struct
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +16,19 @@ from numpy.typing import NDArray
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import MAX_ID, UNKNOWN_ID
+from slam_observer_ros.events import BEARING, MAX_ID, POINT, RANGE, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import encode_string
 from slam_observer_ros.messages.clouds import (
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,
     ID_NAME,
+    NO_RANGE_NAME,
     POINT_FIELD_FLOAT32,
     POINT_FIELD_UINT32,
     POINT_NAMES,
+    RANGE_NAME,
+    RANGE_VARIANCE_NAME,
     UNKNOWN_UINT32_ID,
     VELOCITY_NAMES,
 )
@@ -120,20 +123,26 @@ class OutgoingMessages:
         points: FloatArray,
         covariances: FloatArray | None = None,
         velocities: FloatArray | None = None,
+        kinds: IntArray | None = None,
     ) -> Any:
         """Make a sensor_msgs/PointCloud2: x y z float32, id uint32, and what else is given.
 
         RViz and Foxglove display these fields. Covariances are (n, 3, 3), m², and velocities of
         the landmarks themselves (n, 3), m/s. ``UNKNOWN_ID`` becomes 2³² - 1; any other id that
-        doesn't fit into a uint32 raises a MessageError.
+        doesn't fit into a uint32 raises a MessageError. Of half points, ``kinds`` (n,), a cloud
+        holds ranges alone, or bearings among whole points: others raise a MessageError, too.
         """
-        records = _cloud_records(ids, points, covariances, velocities)
+        if kinds is not None and len(kinds) and (kinds == RANGE).all():
+            columns = _of_ranges(ids, points, covariances)
+        else:
+            columns = _of_points(ids, points, covariances, velocities, kinds)
+        records = _cloud_records(columns)
         fields = [
             self.make(
                 'sensor_msgs/msg/PointField',
                 name=name,
                 offset=4 * index,
-                datatype=POINT_FIELD_UINT32 if name == ID_NAME else POINT_FIELD_FLOAT32,
+                datatype=POINT_FIELD_UINT32 if name in _INTEGERS else POINT_FIELD_FLOAT32,
                 count=1,
             )
             for index, name in enumerate(records.dtype.names or ())
@@ -180,24 +189,54 @@ def encode_point_cloud(stamp_ns: int, frame_id: str, ids: IntArray, points: Floa
     )
 
 
-def _cloud_records(
+_INTEGERS = (ID_NAME, NO_RANGE_NAME)
+"""Fields that are uint32; the others are float32."""
+
+_Columns: TypeAlias = dict[str, FloatArray | IntArray]
+
+
+def _of_ids(ids: IntArray) -> _Columns:
+    if np.any((ids < UNKNOWN_ID) | (ids > MAX_ID)):
+        raise MessageError('landmark ids must lie between 0 and 2³² - 2, or be -1 for unknown')
+    return {ID_NAME: ids & UNKNOWN_UINT32_ID}
+
+
+def _of_points(
     ids: IntArray,
     points: FloatArray,
     covariances: FloatArray | None,
     velocities: FloatArray | None,
-) -> NDArray[np.void]:
-    """Return one record a point, little endian, every field of four bytes."""
-    if np.any((ids < UNKNOWN_ID) | (ids > MAX_ID)):
-        raise MessageError('landmark ids must lie between 0 and 2³² - 2, or be -1 for unknown')
-    columns: dict[str, FloatArray | IntArray] = dict(zip(POINT_NAMES, points.T, strict=True))
-    columns[ID_NAME] = ids & UNKNOWN_UINT32_ID
+    kinds: IntArray | None,
+) -> _Columns:
+    """Return the fields of whole points, and of bearings among them."""
+    columns: _Columns = dict(zip(POINT_NAMES, points.T, strict=True))
+    columns |= _of_ids(ids)
     if covariances is not None:
         upper_triangles = covariances.reshape(-1, 9)[:, _MATRIX_TO_UPPER_TRIANGLE]
         columns |= zip(COVARIANCE_NAMES, upper_triangles.T, strict=True)
     if velocities is not None:
         columns |= zip(VELOCITY_NAMES, velocities.T, strict=True)
-    dtype = [(name, '<u4' if name == ID_NAME else '<f4') for name in columns]
-    records: NDArray[np.void] = np.empty(len(points), dtype=dtype)
+    if kinds is not None:
+        if not np.isin(kinds, (POINT, BEARING)).all():
+            raise MessageError('a cloud has no fields for ranges or azimuths beside other points')
+        columns[NO_RANGE_NAME] = kinds == BEARING
+    return columns
+
+
+def _of_ranges(ids: IntArray, points: FloatArray, covariances: FloatArray | None) -> _Columns:
+    """Return the fields of ranges alone, whose covariance is along their line of sight."""
+    ranges = np.linalg.norm(points, axis=1)
+    columns: _Columns = _of_ids(ids) | {RANGE_NAME: ranges}
+    if covariances is not None:
+        along = points / np.maximum(ranges, np.finfo(np.float64).tiny)[:, None]
+        columns[RANGE_VARIANCE_NAME] = np.einsum('mi,mij,mj->m', along, covariances, along)
+    return columns
+
+
+def _cloud_records(columns: _Columns) -> NDArray[np.void]:
+    """Return one record a point, little endian, every field of four bytes."""
+    dtype = [(name, '<u4' if name in _INTEGERS else '<f4') for name in columns]
+    records: NDArray[np.void] = np.empty(len(columns[ID_NAME]), dtype=dtype)
     for name, column in columns.items():
         records[name] = column
     return records

@@ -1,8 +1,12 @@
-"""Public data sets, in which truth is known: MRCLAM and Starry Night.
+"""Public data sets, in which truth is known: MRCLAM, Plaza and Starry Night.
 
 UTIAS Multi-Robot Cooperative Localization and Mapping, wheeled robots among coded landmarks:
 K. Leung, Y. Halpern, T. Barfoot and H. Liu, *The UTIAS multi-robot cooperative localization and
 mapping dataset*, International Journal of Robotics Research 30(8), 2011.
+
+Plaza, a mower among four radios that give distances: J. Djugash, B. Hamner and S. Roth,
+*Navigating with ranging radios: five data sets with ground truth*, Journal of Field Robotics
+26(9), 2009.
 
 Starry Night, full 3D, a stereo camera and gyroscopes moved by hand above 20 LEDs: data set 3 of
 T. Barfoot's course and book *State Estimation for Robotics*, University of Toronto.
@@ -11,6 +15,7 @@ T. Barfoot's course and book *State Estimation for Robotics*, University of Toro
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 import re
 import warnings
@@ -23,7 +28,7 @@ from slam_observer_ros.common.files import not_special
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.trajectory import LandmarkTruth
-from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.events import BEARING, ObservationEvent, RANGE
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.writer import DataSet
 
@@ -40,8 +45,12 @@ _MAX_NUMBER = 4e9
 """More than any time, barcode or distance of MRCLAM; as nanoseconds it is still an int64."""
 
 
-def load_mrclam(folder: Path | str, robot: int) -> DataSet:
-    """Read one robot's run of MRCLAM.
+MEASURES = {'point': None, 'bearing': BEARING, 'range': RANGE}
+"""What may be left of whole points."""
+
+
+def load_mrclam(folder: Path | str, robot: int, measure: str = 'point') -> DataSet:
+    """Read one robot's run of MRCLAM, or only directions or distances of its landmarks.
 
     Velocities are the commands that the robot was given: forward speed and yaw rate. Landmark ids
     are subject numbers; sightings of other robots and misread barcodes are left out and counted.
@@ -57,6 +66,7 @@ def load_mrclam(folder: Path | str, robot: int) -> DataSet:
     body_velocities[:, 2] = odometry[:, 2]
     body_velocities[:, 3] = odometry[:, 1]
     observations, left_out = _observations(folder, robot)
+    observations = [_measured(event, MEASURES[measure]) for event in observations]
     return DataSet(
         _stamps_ns(odometry),
         body_velocities,
@@ -66,6 +76,15 @@ def load_mrclam(folder: Path | str, robot: int) -> DataSet:
         LandmarkTruth(landmarks[:, 0].astype(np.int64), _on_ground(landmarks[:, 1:3])),
         left_out,
     )
+
+
+def _measured(event: ObservationEvent, kind: int | None) -> ObservationEvent:
+    """Return points (m, 3) as a half sensor would have seen them; as they are if kind is None."""
+    if kind is None:
+        return event
+    ranges = np.linalg.norm(event.points, axis=1)[:, None]
+    points = ranges * [1.0, 0.0, 0.0] if kind == RANGE else event.points / ranges
+    return replace(event, points=points, kinds=np.full(len(points), kind))
 
 
 def _require_robot(folder: Path, robot: int) -> None:
@@ -84,11 +103,13 @@ def _truth(path: Path, columns: int) -> FloatArray:
     return _table(path, columns) if path.exists() else np.empty((0, columns))
 
 
-def _table(path: Path, columns: int) -> FloatArray:
+def _table(path: Path, columns: int, delimiter: str | None = None) -> FloatArray:
+    """Read columns of numbers: below one line of names, if a delimiter is between them."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore')  # No data at all is refused below.
-            table: FloatArray = np.loadtxt(path, ndmin=2)
+            skipped = 0 if delimiter is None else 1
+            table: FloatArray = np.loadtxt(path, ndmin=2, delimiter=delimiter, skiprows=skipped)
     except FileNotFoundError as error:
         raise DataSetError(f'{path}: no such file') from error
     except OSError as error:
@@ -155,6 +176,72 @@ def _observations(folder: Path, robot: int) -> tuple[list[ObservationEvent], Cou
         )
     ]
     return observations, left_out
+
+
+NO_RANGE = 'without a range'
+
+
+def load_plaza(folder: Path | str, run: int) -> DataSet:
+    """Read a run of Plaza: distances from radios, whose ids are the landmarks'.
+
+    The folder has ``plazaN_dr.csv``, the way t, forward m, turn rad since the row before;
+    ``…_gt.csv``, the true t, x, y, yaw; ``…_td.csv``, t, sender, anchor, range m; ``…_tl.csv``,
+    anchor, x, y: t in seconds, each below a line of names. Raises a DataSetError if one is missing
+    or malformed; those of the truth may be missing.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataSetError(f'{folder}: no such directory; give the one of plaza1_td.csv')
+    path = {name: folder / f'plaza{run}_{name}.csv' for name in ('dr', 'gt', 'td', 'tl')}
+    way = _table(path['dr'], 3, ',')
+    truth = _table(path['gt'], 4, ',') if path['gt'].exists() else np.empty((0, 4))
+    measured = _table(path['td'], 4, ',')
+    anchors = _table(path['tl'], 3, ',') if path['tl'].exists() else np.empty((0, 3))
+
+    # A row's way is what was driven since the row before: a mean velocity from there on
+    seconds = np.diff(way[:, 0])
+    lasts = seconds > 0.0
+    body_velocities = np.zeros((int(lasts.sum()), 6))
+    body_velocities[:, [3, 2]] = way[1:][lasts, 1:] / seconds[lasts, None]
+    is_range = measured[:, 3] > 0.0
+    ranges = measured[is_range]
+    ranges = ranges[np.argsort(ranges[:, 0], kind='stable')]
+    observations = [
+        ObservationEvent(
+            stamp_ns, np.array([anchor]), np.array([[range_m, 0.0, 0.0]]), kinds=np.array([RANGE])
+        )
+        for stamp_ns, anchor, range_m in zip(
+            _nanoseconds(ranges).tolist(),
+            ranges[:, 2].astype(np.int64).tolist(),
+            ranges[:, 3].tolist(),
+            strict=True,
+        )
+    ]
+    return DataSet(
+        _nanoseconds(way[:-1][lasts]),
+        body_velocities,
+        observations,
+        _nanoseconds(truth),
+        _planar_poses(_facing_forwards(truth[:, 1:], float(way[:, 1].sum()))),
+        LandmarkTruth(anchors[:, 0].astype(np.int64), _on_ground(anchors[:, 1:])),
+        Counter({NO_RANGE: int(np.sum(~is_range))}),
+    )
+
+
+def _nanoseconds(table: FloatArray) -> IntArray:
+    stamps_ns: IntArray = np.rint(table[:, 0] * NANOSECONDS_PER_SECOND).astype(np.int64)
+    return stamps_ns
+
+
+def _facing_forwards(poses: FloatArray, way_m: float) -> FloatArray:
+    """Return true x, y, yaw (p, 3) with yaw along the motion, as far as the odometry says so.
+
+    In Plaza 2 it is turned by π: the receiver's antennas were mounted back to front.
+    """
+    headings = np.column_stack([np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])])
+    driven_m = float((np.diff(poses[:, :2], axis=0) * headings).sum())
+    turned = np.pi if driven_m * way_m < 0.0 else 0.0
+    return poses + [0.0, 0.0, turned]
 
 
 EPOCH_NS = 1_256_566_448 * NANOSECONDS_PER_SECOND

@@ -182,14 +182,15 @@ class RecordingWriter:
         frame_id: str = BASE_FRAME,
         receive_stamp_ns: int | None = None,
     ) -> None:
-        """Write a PointCloud2 with ids, and covariances and velocities if the event has them."""
+        """Write a PointCloud2 with ids, and what else the event has of its points."""
         message = self.messages.point_cloud2(
             event.stamp_ns,
             frame_id,
             event.ids,
-            event.points,
+            event.lines_of_sight if event.kinds is not None else event.points,
             event.covariances,
             event.velocities,
+            event.kinds,
         )
         self.write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 

@@ -20,6 +20,7 @@ from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
     ObservationEvent,
+    POINT,
     UNKNOWN_ID,
     VelocityEvent,
 )
@@ -200,7 +201,10 @@ def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
         if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
             break
         if isinstance(event, ObservationEvent):
-            kept.append(event.select(event.ids != UNKNOWN_ID))
+            usable = event.ids != UNKNOWN_ID
+            if event.kinds is not None:
+                usable &= event.kinds == POINT
+            kept.append(event.select(usable))
             continue
         kept.append(event)
         if isinstance(event, VelocityEvent):

@@ -69,8 +69,8 @@ def mistakes(
 ) -> list[Finding]:
     """Name the mistakes of the set-up, two at most, that explain what was recorded; none if right.
 
-    Points without ids, whose meaning depends on the set-up, are left out. ``known`` are the maps
-    in one of which the robot was.
+    Points without ids, whose meaning depends on the set-up, are left out, and so are half points,
+    of which other densities are compared. ``known`` are the maps in one of which the robot was.
     """
     search = Search(settings, events, known)
     search.advance(math.inf)

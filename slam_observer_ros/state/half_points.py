@@ -24,7 +24,6 @@ from slam_observer_ros.events import (
     ObservationEvent,
     POINT,
     RANGE,
-    UNKNOWN_ID,
 )
 from slam_observer_ros.geometry.sensor_mounting import directions_of
 from slam_observer_ros.sensor_models.observation_noise import point_covariances
@@ -88,9 +87,7 @@ class HalfPoints:
             return event
         # Zero residuals where nothing was measured would say that the motion is exact.
         state.motion_noise.factors.forget_motion()
-        is_named = (event.ids != UNKNOWN_ID) | (event.kinds == POINT)
-        self._counts.note(Reason.NO_ID, event.ids[~is_named], event.stamp_ns)
-        event = _with_sensor(state, event.select(is_named))
+        event = _with_sensor(state, event)
         rows = state.landmarks.rows_of(event.ids)
         lines, covariances = _completed(state, event, rows)
         entered = np.zeros(len(rows), dtype=np.bool_)

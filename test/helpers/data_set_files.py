@@ -30,6 +30,25 @@ def write_mrclam(folder: Path) -> Path:
     return folder
 
 
+def write_plaza(folder: Path, turned: float = 0.0) -> Path:
+    """Make run 1, 0.5 m ahead and then to the left, whose truth has the yaw ``turned`` by so much.
+
+    A stamp comes twice, and of three distances one is none.
+    """
+    folder.mkdir(exist_ok=True)
+    yaws = [turned, turned, np.pi / 2 + turned]
+    tables = {
+        'dr': ('t,forward_m,turn_rad', [(10, 0, 0), (10.5, 0.5, 0.25), (10.5, 0, 0), (11, 1, 0)]),
+        'gt': ('t,x,y,yaw', [(10, 0, 0, yaws[0]), (10.5, 0.5, 0, yaws[1]), (11, 1, 1, yaws[2])]),
+        'td': ('t,sender,anchor,range_m', [(10.9, 2, 5, 4), (10.1, 2, 1, 3), (10.2, 2, 1, 0)]),
+        'tl': ('anchor,x,y', [(1, 3, 0), (5, 1, 5)]),
+    }
+    for name, (head, rows) in tables.items():
+        lines = [head, *(','.join(f'{number:.6f}' for number in row) for row in rows)]
+        (folder / f'plaza1_{name}.csv').write_text('\n'.join(lines))
+    return folder
+
+
 def write_starry_night(file: Path, **changes: np.ndarray) -> Path:
     """Make two frames of a stereo camera that looks along x; landmark 4 seen in the second."""
     pixels = np.full((4, 2, 20), -1.0)

@@ -162,3 +162,74 @@ def range_bearing(
     header, pose = ros.header(frame_id, stamp_ns), ros.pose((0.0, 0.0, 0.0), NO_TURN)
     whole = header, pose, 0.0, 100.0, *deviations, seen
     return ros.make(f'{package}/ObservationRangeBearing', *whole)
+
+
+def range_beacon(
+    sensed: Iterable[tuple[int, float]],
+    frame_id: str,
+    stamp_ns: int = ros.STAMP_NS,
+    deviation: float = 0.0,
+) -> object:
+    """mrpt_msgs/ObservationRangeBeacon of (id, range)."""
+    package = 'mrpt_msgs/msg'
+    seen = [
+        ros.make(f'{package}/SingleRangeBeaconObservation', distance, number)
+        for number, distance in sensed
+    ]
+    header, pose = ros.header(frame_id, stamp_ns), ros.pose((0.0, 0.0, 0.0), NO_TURN)
+    whole = header, pose, 0.0, 100.0, deviation, seen
+    return ros.make(f'{package}/ObservationRangeBeacon', *whole)
+
+
+def linktrack(
+    frame: str,
+    nodes: Iterable[tuple[float, ...]],
+    frame_id: str | None = None,
+    stamp_ns: int = ros.STAMP_NS,
+) -> object:
+    """A frame of LinkTrack of (id, distance[, angle]); without ``frame_id`` that of ROS 1."""
+    package = 'nlink_parser' if frame_id is None else 'nlink_parser_ros2_interfaces'
+    head = [] if frame_id is None else [ros.header(frame_id, stamp_ns)]
+    node = 'LinktrackAoaNode0' if 'Aoa' in frame else 'LinktrackNode2'
+    seen = [
+        ros.make(f'{package}/msg/{node}', 1, int(number), *measured, -80.0, -79.0)
+        for number, *measured in nodes
+    ]
+    sizes = (3, 3, 3, 3, 4, 3, 3) if frame == 'LinktrackNodeframe2' else ()
+    own = [np.full(size, 9.0, np.float32) for size in sizes]
+    return ros.make(f'{package}/msg/{frame}', *head, 2, 0, 100, 200, 5.0, *own, seen)
+
+
+def beacon_distance(
+    beacon: int, distance: float, name: str = 'marvelmind_ros2_msgs/msg/BeaconDistance'
+) -> object:
+    """Distance from one of Marvelmind's beacons, as ROS 2 has it or ROS 1."""
+    return ros.make(name, 5, beacon, distance)
+
+
+def gtec(name: str, anchor: int, millimetres: int) -> object:
+    """Ranging of gtec_msgs, all of whose other fields are 3."""
+    fields = ros.TYPESTORE.fielddefs[f'gtec_msgs/msg/{name}'][1]
+    others = [3.0 if what[1][0] == 'float64' else 3 for _, what in fields[3:]]
+    return ros.make(f'gtec_msgs/msg/{name}', anchor, 1, millimetres, *others)
+
+
+def one_range(frame_id: str, distance: float, variance: float = 0.0) -> object:
+    """sensor_msgs/Range of a sensor that measures from 0.2 to 50 m."""
+    limits = 0, 0.1, 0.2, 50.0
+    return ros.make('sensor_msgs/msg/Range', ros.header(frame_id), *limits, distance, variance)
+
+
+def ranges_of_packages(number: int = 7) -> list[object]:
+    """A message of each type of packages for radios and beacons, 2 m from one landmark."""
+    frames = 'LinktrackNodeframe2', 'LinktrackNodeframe3', 'LinktrackAoaNodeframe0'
+    nodes = {frame: (number, 2.0, *([90.0] if 'Aoa' in frame else [])) for frame in frames}
+    return [
+        range_beacon([(number, 2.0)], 'camera'),
+        *(linktrack(frame, [node]) for frame, node in nodes.items()),
+        *(linktrack(frame, [node], 'camera') for frame, node in nodes.items()),
+        beacon_distance(number, 2.0),
+        beacon_distance(number, 2.0, 'marvelmind_nav/msg/beacon_distance'),
+        *(gtec(name, number, 2000) for name in ('Ranging', 'GenericRanging')),
+        *(gtec(name, number, 2000) for name in ('DWRanging', 'UWBRanging')),
+    ]

@@ -362,6 +362,7 @@ DETECTIONS = {
         detector.aruco_markers([MARKER], 'camera', package='aruco_interfaces'),
         detector.landmark_list([('7', *MARKER[1:])], 'camera'),
         detector.range_bearing([(7, 2.0, 0.1, 0.2)], 'camera'),
+        *detector.ranges_of_packages(),
     )
 }
 
@@ -410,7 +411,9 @@ def test_what_else_a_topic_carries_is_answered_with_the_types_that_are_read():
     assert landmarks.problem == (
         "'/landmarks' carries sensor_msgs/msg/LaserScan; PointCloud2, PointCloud, "
         'AprilTagDetectionArray, PoseArray, Detection3DArray, ArucoDetection, ArucoMarkers, '
-        'LandmarkList or ObservationRangeBearing is needed'
+        'LandmarkList, ObservationRangeBearing, ObservationRangeBeacon, LinktrackNodeframe2, '
+        'LinktrackNodeframe3, LinktrackAoaNodeframe0, BeaconDistance, beacon_distance, Ranging, '
+        'GenericRanging, DWRanging, UWBRanging or Range is needed'
     )
 
 

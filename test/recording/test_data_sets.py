@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from data_set_files import write_mrclam, write_starry_night
+from data_set_files import write_mrclam, write_plaza, write_starry_night
 import numpy as np
 import pytest
 import scipy.io
 
 from slam_observer_ros.common.errors import DataSetError
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import BEARING, ObservationEvent, RANGE, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.data_sets import (
     EPOCH_NS,
     load_mrclam,
+    load_plaza,
     load_starry_night,
 )
 from slam_observer_ros.recording.graph_files import load_graph
@@ -45,6 +46,25 @@ class TestMrclam:
         np.testing.assert_allclose(first.points, [[0.0, 2.0, 0.0], [3.0, 0.0, 0.0]], atol=1e-12)
         assert second.ids.tolist() == [7]
         assert data_set.left_out == {'robot': 1, 'misread': 1}
+
+    @pytest.mark.parametrize(
+        ('measure', 'kind', 'points'),
+        [
+            ('bearing', BEARING, [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+            ('range', RANGE, [[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]),
+        ],
+    )
+    def test_only_directions_or_distances_are_left_where_asked_for(
+        self, tmp_path, slam_observer, measure, kind, points
+    ):
+        folder, out = write_mrclam(tmp_path / 'run'), tmp_path / 'out.mcap'
+        options = ('--robot', 2, '--measure', measure)
+        slam_observer.succeed('convert', 'mrclam', folder, out, *options)
+        with Recording(out) as recording:
+            events = list(recording.events(recording.find_topics()))
+        seen = next(event for event in events if isinstance(event, ObservationEvent))
+        assert seen.kinds.tolist() == [kind, kind]
+        np.testing.assert_allclose(seen.lines_of_sight, points, atol=1e-7)
 
     def test_commands_and_truth(self, tmp_path):
         data_set = load_mrclam(write_mrclam(tmp_path / 'run'), 2)
@@ -126,6 +146,56 @@ class TestMrclam:
             truth = recording.truth(selected)
         assert not len(truth.stamps_ns)
         assert truth.landmarks is None
+
+
+class TestPlaza:
+    def test_the_way_is_a_mean_velocity_and_each_distance_an_observation(self, tmp_path):
+        data_set = load_plaza(write_plaza(tmp_path / 'plaza'), 1)
+        assert data_set.velocity_stamps_ns.tolist() == [10 * SECOND_NS, 10_500_000_000]
+        expected = [[0, 0, 0.5, 1, 0, 0], [0, 0, 0, 2, 0, 0]]
+        np.testing.assert_allclose(data_set.body_velocities, expected, atol=1e-12)
+        first, last = data_set.observations
+        assert (first.stamp_ns, first.ids.tolist()) == (10_100_000_000, [1])
+        assert first.points.tolist() == [[3, 0, 0]]
+        assert (last.stamp_ns, last.ids.tolist()) == (10_900_000_000, [5])
+        assert last.kinds.tolist() == [RANGE]
+        assert data_set.left_out == {'without a range': 1}
+        assert data_set.landmarks.ids.tolist() == [1, 5]
+
+    @pytest.mark.parametrize('turned', [0.0, np.pi])
+    def test_the_true_heading_is_where_the_robot_drives(self, tmp_path, turned):
+        data_set = load_plaza(write_plaza(tmp_path / 'plaza', turned), 1)
+        np.testing.assert_allclose(data_set.true_poses[0, :3, 0], [1, 0, 0], atol=1e-6)
+
+    def test_the_survey_and_the_start_are_printed_as_replay_takes_them(
+        self, tmp_path, slam_observer, monkeypatch
+    ):
+        monkeypatch.chdir(tmp_path)
+        options = ('convert', 'plaza', write_plaza(tmp_path / 'plaza'), 'out.mcap', '--run', 1)
+        output = slam_observer.succeed(*options).output
+        words = ' '.join(line.split('│')[2] for line in output.splitlines() if '│' in line)
+        given = [word for word in words[words.index('--load-map') :].split() if word]
+        report = slam_observer.succeed('replay', 'out.mcap', '--config', 'uwb', '--json', *given)
+        assert report.json['landmarks'] == 2
+        assert '--force' in slam_observer.fail(*options)
+
+    def test_a_run_without_truth_is_one_of_measurements(self, tmp_path, slam_observer):
+        folder, out = write_plaza(tmp_path / 'plaza'), tmp_path / 'out.mcap'
+        for name in ('gt', 'tl'):
+            (folder / f'plaza1_{name}.csv').unlink()
+        slam_observer.succeed('convert', 'plaza', folder, out, '--run', 1)
+        assert not out.with_suffix('.yaml').exists()
+
+    @pytest.mark.parametrize('content', ['', 't,a,b\n', 't,a,b\n1,2\n', 't,a,b\n1,x,3\n1,2,nan\n'])
+    def test_what_is_wrong_is_named(self, tmp_path, content):
+        folder = write_plaza(tmp_path / 'plaza')
+        with pytest.raises(DataSetError, match=r'plaza3_dr\.csv: no such file'):
+            load_plaza(folder, 3)
+        with pytest.raises(DataSetError, match='no such directory'):
+            load_plaza(tmp_path / 'nowhere', 1)
+        (folder / 'plaza1_dr.csv').write_text(content)
+        with pytest.raises(DataSetError, match=r'plaza1_dr\.csv'):
+            load_plaza(folder, 1)
 
 
 ISAM = """\

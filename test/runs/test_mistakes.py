@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, RANGE, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.runs.corrections import explained, first_drive
 from slam_observer_ros.runs.mistakes import mistakes
@@ -51,6 +51,16 @@ def test_without_ids_or_points_nothing_is_named():
         for event in events
     ]
     assert named(nameless) == named([e for e in events if isinstance(e, VelocityEvent)]) == []
+
+
+def test_of_ranges_alone_no_size_of_tags_is_named():
+    long = [
+        replace(event, points=1.5 * event.points, kinds=np.full(len(event.ids), RANGE))
+        if isinstance(event, ObservationEvent)
+        else event
+        for event in drive()
+    ]
+    assert named(long) == []
 
 
 def test_a_robot_that_stands_is_looked_at_for_longer():

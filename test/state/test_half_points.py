@@ -162,12 +162,13 @@ def test_a_straight_way_leaves_open_on_which_side_an_anchor_is():
     assert world.estimator.counts['waiting_point'] == world.estimator.counts['observed_point']
 
 
-def test_half_points_without_ids_are_left_out_and_counted():
+def test_half_points_without_ids_are_left_out_counted_and_named(caplog):
     world = World(SETTINGS)
     for event in world.seen(np.arange(4), [RANGE]):
         world.estimator.add(replace(event, ids=np.full(4, UNKNOWN_ID)))
     world.estimator.flush()
     assert world.estimator.counts['unknown_id'] == 4
+    assert 'Not used: 4 bearings or ranges alone' in caplog.text
 
 
 def test_an_anchor_above_the_plane_is_as_far_as_it_is_on_the_floor():
