@@ -21,7 +21,7 @@ from slam_observer_ros.cli.options import find_config, named_path
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.known_map.map_file import read_maps
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
@@ -181,6 +181,16 @@ REPEATED = 0.5
 """Share of the velocities that are exactly the one before beyond which they are commands."""
 
 
+FEW = 50
+"""Points of an observation, in the median, up to which they are landmarks and no raw scan."""
+
+FAR_M = 5.0
+"""Range beyond which a camera reads hardly a tag; a laser sees most of its reflectors there."""
+
+FAR_SHARE = 0.25
+"""Share of the points that are so far where a laser scanner sees them."""
+
+
 def _shipped_settings(name: str) -> Settings:
     """Return what a shipped parameter file says of the estimator."""
     known = {row.name for row in table(Settings)}
@@ -200,11 +210,14 @@ def fitting_file(path: Path) -> tuple[str, str, list[Event]]:
         velocities = np.array(
             [event.body_velocity for event in events if isinstance(event, VelocityEvent)]
         ).reshape(-1, 6)
-    return *_fitting(kind, velocities), events
+    seen = [e for e in events if isinstance(e, ObservationEvent) and len(e.ids)]
+    return *_fitting(kind, velocities, seen), events
 
 
-def _fitting(kind: str, velocities: FloatArray) -> tuple[str, str]:
+def _fitting(kind: str, velocities: FloatArray, seen: list[ObservationEvent]) -> tuple[str, str]:
     flat = _is_flat(velocities)
+    if flat and _are_below(seen):
+        return 'floor_codes', 'landmarks with ids are below the sensor, and the robot stays there'
     where = 'the robot stays on a floor' if flat else 'it tilts or climbs: two_d_mode: false'
     if kind == TRANSFORMS:
         return 'tags_on_tf', f'tags are on /tf, and {where}'
@@ -212,12 +225,35 @@ def _fitting(kind: str, velocities: FloatArray) -> tuple[str, str]:
         return 'apriltags', f'landmarks are AprilTags, and {where}'
     if not flat:
         return 'stereo_inertial', 'it tilts or climbs, as what is moved by hand or flies'
+    if _are_reflectors(seen):
+        return (
+            'reflectors',
+            f'points have no ids, are few, and further away than a camera reads tags; {where}',
+        )
     if _are_commands(velocities):
         return (
             'wheeled_bearing_range',
             f'{where}, and its velocities are commands: most are exactly the one before',
         )
     return 'wheeled_robot', f'{where}, and its velocities are measured'
+
+
+def _are_below(seen: list[ObservationEvent]) -> bool:
+    """Return whether a sensor looks down at landmarks with ids."""
+    if not seen or any((e.ids == UNKNOWN_ID).any() for e in seen):
+        return False
+    directions = np.concatenate([e.lines_of_sight for e in seen])
+    aside = np.linalg.norm(directions[:, :2], axis=1)
+    return bool(np.mean(-directions[:, 2] > aside) > 0.5)
+
+
+def _are_reflectors(seen: list[ObservationEvent]) -> bool:
+    """Return whether landmarks are as a laser scanner sees reflectors."""
+    if not seen or any((e.ids != UNKNOWN_ID).any() for e in seen):
+        return False
+    ranges_m = np.concatenate([np.linalg.norm(e.lines_of_sight, axis=1) for e in seen])
+    are_few = np.median([len(e.ids) for e in seen]) <= FEW
+    return bool(are_few and np.mean(ranges_m > FAR_M) > FAR_SHARE)
 
 
 def _is_flat(velocities: FloatArray) -> bool:

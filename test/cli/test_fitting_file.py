@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 
 STEP_NS = 50_000_000
@@ -43,6 +43,48 @@ def test_how_a_robot_moves_says_which_file_fits(tmp_path, capsys, axes, repeated
     assert found['why']
     assert main(['doctor', str(path)]) == 0
     assert expected in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('repeated', [1, 5])
+@pytest.mark.parametrize(
+    ('ids', 'count', 'range_m', 'expected'),
+    [
+        ([UNKNOWN_ID], 8, 12.0, 'reflectors'),
+        ([UNKNOWN_ID], 8, 2.0, None),  # a camera's
+        ([UNKNOWN_ID], 400, 12.0, None),  # a raw scan
+        ([UNKNOWN_ID, 3], 8, 12.0, None),
+    ],
+)
+def test_few_far_points_without_ids_are_reflectors(
+    tmp_path, capsys, ids, count, range_m, expected, repeated
+):
+    random = np.random.default_rng(0)
+    path = tmp_path / 'run.mcap'
+    with RecordingWriter(path) as writer:
+        for number in range(20):
+            velocity = np.array([0.0, 0.0, 0.1, 0.5 + 0.01 * (number // repeated), 0.0, 0.0])
+            writer.write_event(VelocityEvent((2 * number + 1) * STEP_NS, velocity))
+            bearings = random.uniform(-np.pi, np.pi, count)
+            points = np.column_stack([np.cos(bearings), np.sin(bearings), np.zeros(count)])
+            points *= range_m * random.uniform(0.5, 1.0, (count, 1))
+            seen = np.resize(ids, count)
+            writer.write_event(ObservationEvent((2 * number + 2) * STEP_NS, seen, points))
+    assert main(['doctor', str(path), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    otherwise = 'wheeled_robot' if repeated == 1 else 'wheeled_bearing_range'
+    assert found['config'] == (expected or otherwise)
+
+
+def test_landmarks_below_the_sensor_are_codes_on_the_floor(tmp_path, capsys):
+    path = tmp_path / 'run.mcap'
+    with RecordingWriter(path) as writer:
+        for number in range(20):
+            velocity = np.array([0.0, 0.0, 0.1, 0.5 + 0.01 * number, 0.0, 0.0])
+            writer.write_event(VelocityEvent((2 * number + 1) * STEP_NS, velocity))
+            points = np.array([[0.05 - 0.005 * number, 0.02, -0.3]])
+            writer.write_event(ObservationEvent((2 * number + 2) * STEP_NS, np.array([7]), points))
+    assert main(['doctor', str(path), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['config'] == 'floor_codes'
 
 
 def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path, capsys):
