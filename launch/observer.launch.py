@@ -27,6 +27,11 @@ def generate_launch_description():
                 'imu', default_value='imu', description='topic of the angular velocity'
             ),
             DeclareLaunchArgument(
+                'camera_info',
+                default_value='camera_info',
+                description='topic of the calibration of the camera, for detections of pixels',
+            ),
+            DeclareLaunchArgument(
                 'landmark_map', default_value='landmark_map', description='topic of the landmarks'
             ),
             DeclareLaunchArgument(
@@ -55,6 +60,7 @@ def generate_launch_description():
                     ('twist', LaunchConfiguration('twist')),
                     ('landmarks', LaunchConfiguration('landmarks')),
                     ('imu', LaunchConfiguration('imu')),
+                    ('camera_info', LaunchConfiguration('camera_info')),
                     ('landmark_map', LaunchConfiguration('landmark_map')),
                     ('~/odometry', LaunchConfiguration('odometry')),
                     ('pose', LaunchConfiguration('pose')),

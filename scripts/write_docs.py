@@ -50,6 +50,7 @@ INPUTS = {
     'twist': 'the velocity of the robot in its own frame',
     'imu': 'the angular velocity, if `use_imu` is set; `twist` then gives only the linear one',
     'landmarks': "the landmarks seen at one instant in the sensor's frame, with ids or without",
+    'camera_info': 'of the camera whose detections have pixels alone, which are directions by it',
     '/tf': 'sensor poses; `odom_frame` → `base_frame`; fiducials, if asked for',
     '/tf_static': 'sensor poses',
     'initialpose': "where the robot was at its stamp, as RViz's *2D Pose Estimate* gives it",

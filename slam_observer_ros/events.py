@@ -166,6 +166,8 @@ class ObservationEvent:
     # (m,) such as tag36h11, of fiducials whose poses are on /tf: points are NaN until looked up.
     families: tuple[str, ...] | None = None
     kinds: IntArray | None = None  # (m,) POINT to AZIMUTH_RANGE; None where all are whole points
+    # (m, 2) where an image shows them: points are NaN until the camera is looked up.
+    pixels: FloatArray | None = None
 
     def moved(self, pose: FloatArray) -> ObservationEvent:
         """Return it in the frame in which its own has ``pose`` (4, 4)."""
@@ -252,7 +254,7 @@ def _turned(covariances: FloatArray, R: FloatArray) -> FloatArray:
 
 _OF_POINTS = (
     'ids', 'points', 'covariances', 'velocities', 'sensor', 'orientations',
-    'orientation_covariances', 'kinds',
+    'orientation_covariances', 'kinds', 'pixels',
 )  # fmt: skip
 _PLANAR_VELOCITY = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
 _PLANAR_POINT = np.array([1.0, 1.0, 0.0])

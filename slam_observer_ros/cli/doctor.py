@@ -21,7 +21,15 @@ from slam_observer_ros.cli.options import find_config, named_path
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import (
+    AZIMUTH_RANGE,
+    Event,
+    ObservationEvent,
+    POINT,
+    RANGE,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
 from slam_observer_ros.known_map.map_file import read_maps
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
@@ -216,9 +224,14 @@ def fitting_file(path: Path) -> tuple[str, str, list[Event]]:
 
 def _fitting(kind: str, velocities: FloatArray, seen: list[ObservationEvent]) -> tuple[str, str]:
     flat = _is_flat(velocities)
+    where = 'the robot stays on a floor' if flat else 'it tilts or climbs: two_d_mode: false'
+    kinds = {half for e in seen for half in (e.kinds.tolist() if e.kinds is not None else [POINT])}
+    if kinds and POINT not in kinds:
+        has_range = not kinds.isdisjoint((RANGE, AZIMUTH_RANGE))
+        name, what = ('uwb', 'distances') if has_range else ('bearings', 'directions')
+        return name, f'landmarks are seen as {what} alone, and {where}'
     if flat and _are_below(seen):
         return 'floor_codes', 'landmarks with ids are below the sensor, and the robot stays there'
-    where = 'the robot stays on a floor' if flat else 'it tilts or climbs: two_d_mode: false'
     if kind == TRANSFORMS:
         return 'tags_on_tf', f'tags are on /tf, and {where}'
     if kind == APRILTAGS:

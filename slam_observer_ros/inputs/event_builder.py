@@ -51,7 +51,8 @@ class EventBuilder:
     """Makes events in the base frame of measurements, in the order in which these come.
 
     What needs a transform that is not known yet waits for it. After the timeout velocities are
-    taken to be those of the base until their transform is known, and all else is dropped:
+    taken to be those of the base until their transform is known, fiducials that /tf never had are
+    directions, where their camera is known, and all else is dropped:
     ``on_drop`` is called with the reason, and :func:`drop_reason` gives the key to count it by.
     Poses further apart than the velocity's timeout give no velocity.
     """
@@ -174,6 +175,11 @@ class EventBuilder:
         return False
 
     def _give_up(self, measured: Event, deadline_ns: int, error: TransformError) -> list[Event]:
+        if isinstance(measured, ObservationEvent) and self._base_frame.give_up_poses(measured):
+            try:
+                return [self._base_frame.observation(measured)]
+            except TransformError as unplaced:
+                error = unplaced
         if not isinstance(measured, VelocityEvent):
             self._on_drop(error)
             return []

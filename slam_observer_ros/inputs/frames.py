@@ -20,8 +20,15 @@ from slam_observer_ros.common.errors import ParameterError, TransformError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    BEARING,
+    ObservationEvent,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.messages.clouds import is_measured
+from slam_observer_ros.messages.detections import Camera
 from slam_observer_ros.messages.poses import pose_stack, PoseMessage
 from slam_observer_ros.settings.input_settings import InputSettings, Pose6
 
@@ -83,9 +90,17 @@ class _Track:
 
 
 class TransformBuffer:
-    """A tree of frames over the last seconds."""
+    """A tree of frames over the last seconds.
+
+    Attributes
+    ----------
+    cameras : dict of str to Camera
+        What CameraInfo says of the cameras in some of the frames.
+
+    """
 
     def __init__(self) -> None:
+        self.cameras: dict[str, Camera] = {}
         self._tracks: dict[str, _Track] = {}  # of each frame in its newest parent
         self._of_parents: dict[tuple[str, str], _Track] = {}  # by parent and frame
         self._refused: set[str] = set()
@@ -226,16 +241,20 @@ class BaseFrame:
         self._sensor_frame = settings.sensor_frame
         self._tag_frame_prefix = settings.tag_frame_prefix
         self._sensor_pose = _sensor_pose(settings.sensor_pose)
+        self._is_rectified = settings.image_is_rectified
+        self._without_poses: set[str] = set()  # frames of cameras whose tags /tf does not have
 
     def observation(self, event: ObservationEvent) -> ObservationEvent:
         """Return landmarks in the base frame; those measured in the map's frame are refused.
 
         Its ``sensor_frame`` is '' where they were measured in the base frame itself. Fiducials
-        are where /tf has them in the camera's frame.
+        are where /tf has them in the camera's frame; what only an image shows is a direction.
         """
         frame_id = self._sensor_frame or event.sensor_frame
-        if event.families is not None:
+        if event.families is not None and not self._is_without_poses(event):
             event = self._placed_tags(event, event.families, frame_id)
+        elif event.pixels is not None:
+            event = self._seen_directions(event)
         plain = frame_id.lstrip('/')
         axis = _ALONG_Z if OPTICAL in plain else _ALONG_X
         event = replace(event, sensor_frame='' if plain == self.name else plain, sensor_axis=axis)
@@ -270,7 +289,61 @@ class BaseFrame:
         poses = np.array(found).reshape(-1, 4, 4)
         R = poses[:, :3, :3]
         R[(np.eye(3) == R).all(axis=(1, 2))] = 0.0  # unknown, as where nobody filled it in
-        return replace(event, points=poses[:, :3, 3], orientations=R, families=None)
+        return replace(event, points=poses[:, :3, 3], orientations=R, families=None, pixels=None)
+
+    def give_up_poses(self, event: ObservationEvent) -> bool:
+        """Return whether fiducials whose poses have not come in time are directions from now on.
+
+        They are where their camera is known, and /tf has never had any of them: their size is
+        not known to the detector then.
+        """
+        camera = event.sensor_frame.lstrip('/')
+        if event.families is None or event.pixels is None:
+            return False
+        if camera not in self._transforms.cameras:
+            return False
+        if self._is_any_on_tf(event):
+            return False
+        if camera not in self._without_poses:
+            self._without_poses.add(camera)
+            logger.info(
+                "Fiducials in '%s' are directions from now on: /tf does not have where they are.",
+                camera,
+            )
+        return True
+
+    def expect_no_poses(self) -> None:
+        """Take fiducials of all known cameras for directions: their poses will not come."""
+        self._without_poses |= set(self._transforms.cameras)
+
+    def _is_without_poses(self, event: ObservationEvent) -> bool:
+        camera = event.sensor_frame.lstrip('/')
+        return camera in self._without_poses and not self._is_any_on_tf(event)
+
+    def _is_any_on_tf(self, event: ObservationEvent) -> bool:
+        """Return whether /tf has, or had, the frame of one of the fiducials."""
+        families, prefix = event.families or (), self._tag_frame_prefix
+        names = [
+            name
+            for family, number in zip(families, event.ids.tolist(), strict=True)
+            for name in (f'{family}:{number}', f'{prefix}{number}')
+        ]
+        return any(self._transforms.parent_of(name) is not None for name in names)
+
+    def _seen_directions(self, event: ObservationEvent) -> ObservationEvent:
+        """Return what an image shows as directions, in the axes of its camera."""
+        camera = self._transforms.cameras.get(event.sensor_frame.lstrip('/'))
+        if camera is None or event.pixels is None:
+            raise TransformError(
+                f"no CameraInfo of '{event.sensor_frame}' has come (on camera_info), without "
+                'which a pixel is no direction'
+            )
+        # Fiducials are found in the rectified image, whose name apriltag_ros subscribes to.
+        is_rectified = self._is_rectified or event.families is not None
+        directions = camera.directions(event.pixels, is_rectified=is_rectified)
+        kinds = np.full(len(directions), BEARING)
+        seen = replace(event, points=directions, kinds=kinds, families=None, pixels=None)
+        return seen.select(is_measured(directions))
 
     def _refuse_map_frame(self, frame_id: str) -> None:
         """Refuse landmarks that the estimate itself would bring to where it has them."""

@@ -6,6 +6,7 @@ Messages are read from their bytes, so that none of the packages that define the
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 import re
@@ -14,9 +15,9 @@ import numpy as np
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.messages.cdr import CdrReader
-from slam_observer_ros.messages.clouds import skip_cloud
+from slam_observer_ros.events import BEARING, MAX_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.clouds import is_measured, skip_cloud
 from slam_observer_ros.messages.fiducials import NESTED, observed_poses, orientations_of
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.messages.registry import Decoder, reads
@@ -24,12 +25,17 @@ from slam_observer_ros.messages.registry import Decoder, reads
 APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'  # ids of fiducials that /tf has
 POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 DETECTIONS = 'vision_msgs/msg/Detection3DArray'
+BOXES = 'vision_msgs/msg/Detection2DArray'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+IN_IMAGES = (APRILTAGS, BOXES)
+"""Types that have pixels, which are directions where the camera's CameraInfo is known."""
 
 _POSE = 7
 _COVARIANCE = 36
 _SIZE = 3
 _CORNERS = 10
 _HOMOGRAPHY = 9
+_BOX = 5  # centre, rotation and size
 MAX_NAMES = 12  # names of frames that a log line lists
 
 _TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
@@ -53,10 +59,15 @@ def decode_apriltags(reader: CdrReader) -> ObservationEvent:
     """Read an apriltag_msgs/AprilTagDetectionArray: which fiducials are seen; /tf has where."""
     stamp_ns, frame_id = reader.header()
     tags = [_read_apriltag(reader) for _ in range(reader.uint32())]
-    ids = np.array([number for number, _ in tags], dtype=np.int64)
-    families = tuple(name for _, name in tags)
-    unknown = np.full((len(tags), 3), np.nan)
-    return ObservationEvent(stamp_ns, ids, unknown, sensor_frame=frame_id, families=families)
+    ids = np.array([number for number, _, _ in tags], dtype=np.int64)
+    return ObservationEvent(
+        stamp_ns,
+        ids,
+        np.full((len(tags), 3), np.nan),
+        sensor_frame=frame_id,
+        families=tuple(name for _, name, _ in tags),
+        pixels=np.array([centre for _, _, centre in tags]).reshape(-1, 2),
+    )
 
 
 @reads(POSE_ARRAY, role='landmarks', is_ambiguous=True)
@@ -192,14 +203,19 @@ def _read_detection(
             reader.uint8()
         else:
             name = reader.string()
-    names = [name, *(class_id for class_id, _, _ in results[:1])]
-    ids = (_id_in_name(name) for name in names)
-    landmark_id = next((number for number in ids if number != UNKNOWN_ID), UNKNOWN_ID)
+    landmark_id = _id_of(name, results)
     if results and results[0][1][:3].any():
         _, pose, covariance = results[0]
         return landmark_id, pose, covariance
     # Detectors that fill in the box only leave the position of the result at zero.
     return landmark_id, centre, np.zeros((6, 6))
+
+
+def _id_of(name: str, results: Sequence[tuple[str, FloatArray, FloatArray]]) -> int:
+    """Return the number that ends the id of a detection, or else its first result's class."""
+    names = [name, *(class_id for class_id, _, _ in results[:1])]
+    ids = (_id_in_name(name) for name in names)
+    return next((number for number in ids if number != UNKNOWN_ID), UNKNOWN_ID)
 
 
 def _read_result(reader: CdrReader, has_numbers: bool) -> tuple[str, FloatArray, FloatArray]:
@@ -212,13 +228,158 @@ def _read_result(reader: CdrReader, has_numbers: bool) -> tuple[str, FloatArray,
     return name, values[1 : 1 + _POSE], covariance
 
 
-def _read_apriltag(reader: CdrReader) -> tuple[int, str]:
-    """Read an apriltag_msgs/AprilTagDetection: id and family."""
+def _read_apriltag(reader: CdrReader) -> tuple[int, str, FloatArray]:
+    """Read an apriltag_msgs/AprilTagDetection: id, family and centre (2,), pixels."""
     family = reader.string()
     landmark_id = reader.int32()
     reader.int32()  # hamming distance
     reader.float32(2)  # goodness, decision margin
-    reader.float64(_CORNERS + _HOMOGRAPHY)
+    centre = reader.float64(_CORNERS + _HOMOGRAPHY)[:2]
     if landmark_id < 0:
         raise MessageError(f'negative tag id {landmark_id}')
-    return landmark_id, family
+    return landmark_id, family, centre
+
+
+@reads(
+    BOXES,
+    role='landmarks',
+    definition=(
+        'std_msgs/Header header\nDetection2D[] detections\n'
+        f'{NESTED}vision_msgs/Detection2D\nstd_msgs/Header header\n'
+        'ObjectHypothesisWithPose[] results\nBoundingBox2D bbox\nstring id\n'
+        f'{NESTED}vision_msgs/ObjectHypothesisWithPose\n'
+        'ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
+        f'{NESTED}vision_msgs/ObjectHypothesis\nstring class_id\nfloat64 score\n'
+        f'{NESTED}vision_msgs/BoundingBox2D\nPose2D center\nfloat64 size_x\nfloat64 size_y\n'
+        f'{NESTED}vision_msgs/Pose2D\nPoint2D position\nfloat64 theta\n'
+        f'{NESTED}vision_msgs/Point2D\nfloat64 x\nfloat64 y\n'
+    ),
+)
+def decode_boxes(reader: CdrReader) -> ObservationEvent:
+    """Read a vision_msgs/Detection2DArray: in which directions the centres of boxes are.
+
+    Ids are those of a Detection3DArray.
+    """
+    stamp_ns, frame_id = reader.header()
+    boxes = [_read_box(reader) for _ in range(reader.uint32())]
+    ids = np.array([landmark_id for landmark_id, _ in boxes], dtype=np.int64)
+    pixels = np.array([centre for _, centre in boxes]).reshape(-1, 2)
+    event = ObservationEvent(
+        stamp_ns,
+        ids,
+        np.full((len(ids), 3), np.nan),
+        sensor_frame=frame_id,
+        kinds=np.full(len(ids), BEARING),
+        pixels=pixels,
+    )
+    return event.select(is_measured(pixels))
+
+
+def _read_box(reader: CdrReader) -> tuple[int, FloatArray]:
+    """Read a vision_msgs/Detection2D: id and centre (2,), pixels."""
+    reader.header()
+    results = [_read_result(reader, False) for _ in range(reader.uint32())]
+    centre = reader.float64(_BOX)[:2]
+    return _id_of(reader.string(), results), centre
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """What a CameraInfo says: in which direction from a camera a pixel is.
+
+    The image is rectified, or raw with the lens' distortion. Of both images a part may be sent,
+    and each pixel be one of several.
+    """
+
+    rectified: FloatArray  # (4,) fx, fy, cx, cy, pixels of the whole image
+    raw: FloatArray  # (4,) the same of the raw image
+    model: str  # of the distortion, as sensor_msgs/distortion_models.hpp names it
+    distortion: FloatArray
+    binning: FloatArray  # (2,) how many pixels are one, horizontally and vertically
+    offset: FloatArray  # (2,) first pixel that was sent
+
+    def directions(self, pixels: FloatArray, *, is_rectified: bool) -> FloatArray:
+        """Return unit vectors (m, 3), z forward, of pixels (m, 2); NaN where the lens has none."""
+        figures = self.rectified if is_rectified else self.raw
+        at = (pixels * self.binning + self.offset - figures[2:]) / figures[:2]
+        if not is_rectified and self.distortion.any():
+            if self.model == 'equidistant':
+                return _from_fisheye(at, self.distortion)
+            at = _undistorted(at, self.distortion, 0.1 / float(figures[:2].max()))
+        lines = np.column_stack([at, np.ones(len(at))])
+        directions: FloatArray = lines / np.linalg.norm(lines, axis=1)[:, None]
+        return directions
+
+
+POLYNOMIALS = ('plumb_bob', 'rational_polynomial', '')
+MODELS = (*POLYNOMIALS, 'equidistant', 'none')
+_ITERATIONS = 100
+_MATRICES = (9, 9, 12)  # K, R and P
+
+
+def decode_camera_info(raw: Buffer) -> tuple[str, Camera]:
+    """Read a sensor_msgs/CameraInfo: its frame, and the camera.
+
+    Raise a MessageError if the camera is not calibrated.
+    """
+    reader = CdrReader(raw)
+    _, frame_id = reader.header()
+    reader.uint32(), reader.uint32()  # height and width
+    model = reader.string()
+    distortion = reader.float64(reader.uint32())
+    K, _, P = (reader.float64(size) for size in _MATRICES)
+    binning = np.array([reader.uint32(), reader.uint32()], dtype=np.float64)
+    offset = np.array([reader.uint32(), reader.uint32()], dtype=np.float64)
+    reader.uint32(), reader.uint32(), reader.uint8()  # size of the part, whether it is rectified
+    reader.finish()
+    figures = K[[0, 4, 2, 5]]
+    rectified = P[[0, 5, 2, 6]] if P[0] > 0.0 else figures
+    numbers = np.concatenate([figures, rectified, distortion])
+    if not (np.isfinite(numbers).all() and min(*figures[:2], *rectified[:2]) > 0.0):
+        raise MessageError(f"the camera of '{frame_id}' is not calibrated: CameraInfo has no K")
+    if distortion.any() and model not in MODELS:
+        raise MessageError(f"the distortion model '{model}' is not one of {', '.join(MODELS)}")
+    binning = np.maximum(binning, 1.0)  # zero means one
+    return frame_id, Camera(rectified, figures, model, distortion, binning, offset)
+
+
+def _distorted(at: FloatArray, distortion: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the radial factor (m, 1) and the tangential shift (m, 2) at x/z, y/z (m, 2)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(distortion, (0, 8))[:8]
+    x, y = at.T
+    r2 = x**2 + y**2
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    shift_x = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    shift_y = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    return radial[:, None], np.column_stack([shift_x, shift_y])
+
+
+def _undistorted(shown: FloatArray, distortion: FloatArray, tolerance: float) -> FloatArray:
+    """Return x/z, y/z (m, 2) that the lens shows there; NaN where none is within a tolerance."""
+    with np.errstate(all='ignore'):
+        at = shown
+        for _ in range(_ITERATIONS):
+            radial, shift = _distorted(at, distortion)
+            at = (shown - shift) / radial
+        radial, shift = _distorted(at, distortion)
+        off = np.abs(radial * at + shift - shown).max(axis=1, initial=0.0)
+        found: FloatArray = np.where((off < tolerance)[:, None], at, np.nan)
+    return found
+
+
+def _from_fisheye(shown: FloatArray, distortion: FloatArray) -> FloatArray:
+    """Return unit vectors (m, 3) of a lens whose angle θ is shown at θ (1 + k₁θ² + …)."""
+    k = np.pad(distortion, (0, 4))[:4]
+    powers = 2 * np.arange(1, 5)
+    radius = np.linalg.norm(shown, axis=1)
+    with np.errstate(all='ignore'):
+        angle = radius
+        for _ in range(_ITERATIONS):
+            squares = angle[:, None] ** powers
+            slope = 1.0 + squares @ (k * (1 + powers))
+            angle = angle - (angle * (1.0 + squares @ k) - radius) / slope
+        off = np.abs(angle * (1.0 + angle[:, None] ** powers @ k) - radius)
+        angle = np.where((off < 1e-6) & (angle >= 0.0) & (angle <= np.pi), angle, np.nan)
+        around = np.where(radius[:, None] > 0.0, shown / radius[:, None], 0.0)
+    directions: FloatArray = np.column_stack([np.sin(angle)[:, None] * around, np.cos(angle)])
+    return directions

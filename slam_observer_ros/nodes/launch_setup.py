@@ -71,6 +71,7 @@ ARGUMENTS = {
     'twist': ('odom', 'topic of the velocity'),
     'landmarks': ('landmarks', 'topic of the observations'),
     'imu': ('imu', 'topic of the angular velocity'),
+    'camera_info': ('camera_info', 'topic of the calibration of the camera, for pixels'),
     'odometry': ('~/odometry', 'topic of the estimate'),
     'pose': ('amcl_pose', 'topic of the pose'),
     'base_frame': ('', 'frame of the robot; empty: as params_file says'),
@@ -108,7 +109,7 @@ def parameters(given: Mapping[str, str], has_bond: bool) -> dict[str, object]:
 def remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
     """Return the node's remappings."""
     return [
-        *((name, given[name]) for name in ('twist', 'landmarks', 'imu', 'pose')),
+        *((name, given[name]) for name in ('twist', 'landmarks', 'imu', 'camera_info', 'pose')),
         ('~/odometry', given['odometry']),
         # as Nav2's nodes have it: each robot has its own below its namespace
         ('/tf', 'tf'),

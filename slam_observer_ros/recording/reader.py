@@ -26,6 +26,7 @@ from slam_observer_ros.inputs.event_builder import (
     with_receive_time,
 )
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms, TransformBuffer
+from slam_observer_ros.messages.detections import decode_camera_info
 from slam_observer_ros.messages.poses import PoseBlock
 from slam_observer_ros.messages.registry import BlockDecoder
 from slam_observer_ros.recording.contents import Arrivals, Contents
@@ -182,8 +183,11 @@ class Recording:
         counted in :attr:`malformed`, what was dropped in :attr:`dropped`; the first is logged.
         """
         transforms = self._static_transforms(selected)
+        base_frame = BaseFrame(inputs, transforms)
+        if selected.cameras and self.contents.missing_tags(selected, inputs.tag_frame_prefix):
+            base_frame.expect_no_poses()
         builder = EventBuilder(
-            BaseFrame(inputs, transforms), inputs.transform_timeout, velocity_timeout_s, self._drop
+            base_frame, inputs.transform_timeout, velocity_timeout_s, self._drop
         )
         decoders = input_decoders(selected, inputs)
         simulated = {
@@ -220,6 +224,7 @@ class Recording:
             *selected.inputs,
             *selected.transforms.static,
             *selected.transforms.moving,
+            *selected.cameras,
             *(topic for topic in optional if topic is not None),
         ]
         return self._copy(writer, selected, topics)
@@ -284,6 +289,11 @@ class Recording:
         transforms = TransformBuffer()
         for raw in self._source.messages(selected.transforms.static):
             self._insert(transforms, raw, is_static=True)
+        for topic in selected.cameras:
+            first = next(self._all_decoded(topic, lambda raw: decode_camera_info(raw.data)), None)
+            if first is not None:
+                frame, camera = first
+                transforms.cameras.setdefault(frame.lstrip('/'), camera)
         return transforms
 
     def _decoded(

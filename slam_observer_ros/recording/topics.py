@@ -10,6 +10,7 @@ from os.path import commonpath
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.messages.clouds import CLOUDS
+from slam_observer_ros.messages.detections import CAMERA_INFO, IN_IMAGES
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recording.sources import last_part, Topic
 from slam_observer_ros.settings.input_settings import (
@@ -61,6 +62,8 @@ class SelectedTopics:
     landmark_truth: Topic | None
     transforms: TransformTopics
     imu: Topic | None = None
+    cameras: tuple[Topic, ...] = ()
+    """CameraInfo, where landmarks are pixels or may be."""
 
     @property
     def inputs(self) -> tuple[Topic, ...]:
@@ -123,6 +126,9 @@ def select_topics(
         choice.pick(_LANDMARK_TRUTH, names.landmark_truth),
         transform_topics(topics, (velocity, landmarks)),
         choice.require(_of_imus(), names.imu) if inputs.use_imu else None,
+        tuple(topic for topic in used if topic.message_type == CAMERA_INFO)
+        if landmarks.message_type in IN_IMAGES
+        else (),
     )
     if selected.pose_truth is None:
         _warn_of_unread_truth(used)

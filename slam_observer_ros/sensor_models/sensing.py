@@ -16,7 +16,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import RangePower, Update
-from slam_observer_ros.events import flatten, ObservationEvent
+from slam_observer_ros.events import flatten, ObservationEvent, POINT
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.sensor_mounting import Sensed, sensitivity, turning
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -138,6 +138,8 @@ class RangeErrors:
 
     def note_event(self, event: ObservationEvent) -> None:
         """Take in an observation that is going to be used."""
+        if event.kinds is not None:  # half points have no range, or none off an axis
+            event = event.select(event.kinds == POINT)
         if self._count < MAX_OBSERVATIONS:
             self._waiting.append(flatten(event) if self._is_planar else event)
 

@@ -123,6 +123,11 @@ class InputSettings:
     tag_frame_prefix: str = parameter(
         'tag_', "Name of a fiducial's frame before its id; family:id, as of apriltag_ros, fits too"
     )
+    image_is_rectified: bool = parameter(
+        True,
+        'Whether 2D detections are pixels of the rectified image, as fiducials always are, or of '
+        "the raw one, whose distortion is taken out by the camera's CameraInfo",
+    )
     map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks', basic=True)
     odom_frame: str = parameter(
         'odom',

@@ -75,6 +75,30 @@ def apriltags(seen):
     return detector.apriltags(seen_tags, CAMERA_FRAME, seen.stamp_ns)
 
 
+def directions(seen):
+    dtype = [('x', '<f8'), ('y', '<f8'), ('z', '<f8'), ('id', '<i4'), ('no_range', '<u1')]
+    records = np.zeros((1, len(seen.ids)), dtype=dtype)
+    lengths = np.linalg.norm(seen.points, axis=1)
+    for axis, name in enumerate('xyz'):
+        records[name] = seen.points[:, axis] / lengths
+    records['id'], records['no_range'] = seen.ids, 1
+    message = ros.point_cloud2(records, CAMERA_FRAME)
+    message.header = ros.header(CAMERA_FRAME, seen.stamp_ns)
+    return message
+
+
+def boxes_in_image(seen):
+    names = (f'lamp_{number}' for number in seen.ids)
+    found = zip(names, detector.pixels_of(seen.points), strict=True)
+    return detector.boxes(found, CAMERA_FRAME, seen.stamp_ns)
+
+
+def tags_in_image(seen):
+    seen_tags = [('tag36h11', int(number)) for number in seen.ids]
+    pixels = detector.pixels_of(seen.points).tolist()
+    return detector.apriltags(seen_tags, CAMERA_FRAME, seen.stamp_ns, pixels)
+
+
 def markers(build, seen):
     found = [
         (int(number), point, detector.NO_TURN)
@@ -109,6 +133,10 @@ MESSAGES = {
     '/tag_detections': partial(markers, detector.isaac_apriltags),
     '/landmark_list': landmark_list,
     '/range_bearing': range_bearing,
+    '/directions': directions,
+    '/boxes_in_image': boxes_in_image,
+    '/tags_in_image': tags_in_image,
+    '/camera_info': lambda _seen: detector.camera_info(CAMERA_FRAME),
     '/tf': lambda seen: tags(seen, 'tag36h11:'),
     '/tags/tf': lambda seen: tags(seen, 'dock'),
 }
@@ -156,6 +184,10 @@ def recordings(tmp_path_factory):
         'mrpt': ['/range_bearing'],
         'two': ['/detections', '/boxes'],
         'unplaced': ['/detections'],
+        'directions': ['/directions'],
+        'boxes in images': ['/boxes_in_image', '/camera_info'],
+        'tags in images': ['/tags_in_image', '/camera_info'],
+        'no camera': ['/boxes_in_image'],
     }
     return {name: record(folder / name, *topics) for name, topics in chosen.items()}
 
@@ -209,6 +241,22 @@ def assert_same(actual, expected):
 )  # fmt: skip
 def test_detections_with_ids_replay_like_a_cloud(recordings, estimate, name, options):
     assert_same(estimate(recordings[name], *options), estimate(recordings['all']))
+
+
+@pytest.mark.parametrize('name', ['boxes in images', 'tags in images'])
+def test_pixels_replay_like_directions(recordings, slam_observer, estimate, tmp_path, name):
+    """In a map, by the CameraInfo that was recorded."""
+    known = tmp_path / 'known.yaml'
+    slam_observer.succeed('replay', recordings['all'], '--map', known)
+    options = ('--load-map', known, '--set', 'set_initial_pose=true')
+    actual = estimate(recordings[name], *options)
+    assert_same(actual, estimate(recordings['directions'], *options))
+
+
+def test_pixels_of_a_camera_that_nobody_knows_are_dropped_and_reported(recordings, slam_observer):
+    ended = slam_observer('replay', recordings['no camera'], '--json')
+    assert ended.json['dropped'] == {'no_transform': 41}
+    assert "no CameraInfo of 'camera_optical_frame' has come" in ended.errors
 
 
 @pytest.mark.parametrize(

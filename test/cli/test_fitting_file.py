@@ -8,19 +8,26 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import (
+    BEARING,
+    ObservationEvent,
+    RANGE,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
 from slam_observer_ros.recording.writer import RecordingWriter
 
 STEP_NS = 50_000_000
 SEEN = np.array([[2.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
 
 
-def recording(path, velocities):
+def recording(path, velocities, kind=None):
     with RecordingWriter(path) as writer:
         for number, velocity in enumerate(velocities, 1):
             writer.write_event(VelocityEvent(number * STEP_NS, velocity))
         stamp_ns = (len(velocities) + 1) * STEP_NS
-        writer.write_event(ObservationEvent(stamp_ns, np.array([1, 2]), SEEN))
+        kinds = None if kind is None else np.array([kind, kind])
+        writer.write_event(ObservationEvent(stamp_ns, np.array([1, 2]), SEEN, kinds=kinds))
     return path
 
 
@@ -85,6 +92,16 @@ def test_landmarks_below_the_sensor_are_codes_on_the_floor(tmp_path, capsys):
             writer.write_event(ObservationEvent((2 * number + 2) * STEP_NS, np.array([7]), points))
     assert main(['doctor', str(path), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['config'] == 'floor_codes'
+
+
+@pytest.mark.parametrize(('kind', 'expected'), [(RANGE, 'uwb'), (BEARING, 'bearings')])
+def test_what_is_seen_as_distances_or_directions_alone_has_its_file(
+    tmp_path, capsys, kind, expected
+):
+    velocities = np.zeros((20, 6))
+    velocities[:, 3] = np.linspace(0.1, 1.0, 20)
+    assert main(['doctor', str(recording(tmp_path / 'run.mcap', velocities, kind)), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['config'] == expected
 
 
 def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path, capsys):

@@ -65,15 +65,58 @@ def detections(items: Iterable[object], frame_id: str, stamp_ns: int = ros.STAMP
     return ros.make('vision_msgs/msg/Detection3DArray', header, list(items))
 
 
-def apriltags(
-    tags: Iterable[tuple[str, int]], frame_id: str, stamp_ns: int = ros.STAMP_NS
+def boxes(
+    seen: Iterable[tuple[str, Sequence[float]]], frame_id: str, stamp_ns: int = ros.STAMP_NS
 ) -> object:
-    """apriltag_msgs/AprilTagDetectionArray of (family, id)."""
-    point = ros.make('apriltag_msgs/msg/Point', 0.0, 0.0)
+    """vision_msgs/Detection2DArray of (id, pixel of the centre)."""
+    package = 'vision_msgs/msg'
+    found = []
+    for name, pixel in seen:
+        pose = ros.make(f'{package}/Pose2D', ros.make(f'{package}/Point2D', *pixel), 0.3)
+        box = ros.make(f'{package}/BoundingBox2D', pose, 20.0, 10.0)
+        found.append(ros.make(f'{package}/Detection2D', ros.header(frame_id), [], box, name))
+    return ros.make(f'{package}/Detection2DArray', ros.header(frame_id, stamp_ns), found)
+
+
+FOCAL_LENGTHS, CENTRE = (600.0, 610.0), (320.0, 240.0)
+
+
+def camera_info(
+    frame_id: str,
+    model: str = 'plumb_bob',
+    distortion: Sequence[float] = (),
+    binning: tuple[int, int] = (0, 0),
+    offset: tuple[int, int] = (0, 0),
+    focal_lengths: tuple[float, float] = FOCAL_LENGTHS,
+) -> object:
+    """sensor_msgs/CameraInfo of 640 × 480 pixels; zeros are as of a camera not calibrated."""
+    (fx, fy), (cx, cy) = focal_lengths, CENTRE
+    K = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
+    P = np.insert(K.reshape(3, 3), 3, 0.0, axis=1).ravel()
+    part = ros.make('sensor_msgs/msg/RegionOfInterest', *offset, 0, 0, False)
+    lens = 480, 640, model, np.array(distortion, dtype=float), K, np.eye(3).ravel(), P
+    return ros.make('sensor_msgs/msg/CameraInfo', ros.header(frame_id), *lens, *binning, part)
+
+
+def pixels_of(points: np.ndarray) -> np.ndarray:
+    """Return where that camera shows points (m, 3) before it: pixels (m, 2)."""
+    return points[:, :2] / points[:, 2:] * FOCAL_LENGTHS + CENTRE
+
+
+def apriltags(
+    tags: Iterable[tuple[str, int]],
+    frame_id: str,
+    stamp_ns: int = ros.STAMP_NS,
+    centres: Sequence[Sequence[float]] | None = None,
+) -> object:
+    """apriltag_msgs/AprilTagDetectionArray of (family, id), and of the centres' pixels."""
+    tags = list(tags)
+    pixels = [(0.0, 0.0)] * len(tags) if centres is None else centres
+    points = [ros.make('apriltag_msgs/msg/Point', *pixel) for pixel in pixels]
     seen = [
         ros.make('apriltag_msgs/msg/AprilTagDetection', family, number, 0, 1.0, 2.0, point,
                  [point] * 4, np.zeros(9))
-        for family, number in tags
+        for (family, number), point in zip(tags, points, strict=True)
     ]  # fmt: skip
     header = ros.header(frame_id, stamp_ns)
     return ros.make('apriltag_msgs/msg/AprilTagDetectionArray', header, seen)

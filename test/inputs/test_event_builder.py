@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 import logging
 
+import detector_messages as detector
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
+import ros_messages as ros
 
 from slam_observer_ros.common.errors import TransformError
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import BEARING, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import drop_reason, EventBuilder, MAX_WAITING
 from slam_observer_ros.inputs.frames import BaseFrame, TransformBuffer
+from slam_observer_ros.messages.detections import decode_camera_info
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -50,6 +53,22 @@ def tags_seen(frame, *ids):
     ids = ids or (3,)
     unknown, families = np.full((len(ids), 3), np.nan), ('tag36h11',) * len(ids)
     return ObservationEvent(0, np.array(ids), unknown, sensor_frame=frame, families=families)
+
+
+PIXELS_CAMERA = decode_camera_info(ros.serialise(detector.camera_info('camera')))[1]
+
+
+def pixels_seen(stamp_ns, points, is_tags):
+    """Return what an image shows of points (m, 3) before the camera."""
+    ids = np.arange(3, 3 + len(points))
+    return ObservationEvent(
+        stamp_ns,
+        ids,
+        np.full((len(ids), 3), np.nan),
+        sensor_frame='camera',
+        families=('tag36h11',) * len(ids) if is_tags else None,
+        pixels=detector.pixels_of(points),
+    )
 
 
 def of_base(stamp_ns):
@@ -141,6 +160,62 @@ def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
     with pytest.raises(TransformError, match=reason):
         settings = InputSettings(sensor_frame=frame)
         BaseFrame(settings, everything_placed()).observation(replace(event, sensor_frame='camera'))
+
+
+POINTS = np.array([[0.5, 0.2, 2.0], [-1.0, 0.1, 4.0]])
+"""Before the camera, z forward."""
+
+
+def assert_directions(event):
+    assert event.kinds.tolist() == [BEARING] * 2
+    assert event.pixels is event.families is None
+    lines = POINTS @ CAMERA[:3, :3].T
+    expected = lines / np.linalg.norm(lines, axis=1)[:, None]
+    assert_allclose(event.lines_of_sight, expected, atol=1e-12)
+    assert_allclose(event.sensor, np.tile(CAMERA[:3, 3], (2, 1)))
+
+
+def test_pixels_are_directions_from_the_camera_once_it_is_known():
+    transforms, dropped = TransformBuffer(), []
+    transforms.insert('base_link', 'camera', 0, CAMERA, is_static=True)
+    builder = EventBuilder(BaseFrame(InputSettings(), transforms), 0.5, 0.5, dropped.append)
+    assert builder.add(pixels_seen(0, POINTS, is_tags=False), 0) == []
+    assert builder.retry(500 * MS) == []
+    assert "no CameraInfo of 'camera' has come" in str(dropped[0])
+    transforms.cameras['camera'] = PIXELS_CAMERA
+    (event,) = builder.add(pixels_seen(0, POINTS, is_tags=False), 500 * MS)
+    assert_directions(event)
+
+
+def test_tags_that_tf_never_had_are_directions_after_the_timeout_and_then_at_once():
+    transforms = TransformBuffer()
+    transforms.insert('base_link', 'camera', 0, CAMERA, is_static=True)
+    transforms.cameras['camera'] = PIXELS_CAMERA
+    builder = EventBuilder(BaseFrame(InputSettings(), transforms), 0.5, 0.5, on_drop=None)
+    assert builder.add(pixels_seen(0, POINTS, is_tags=True), 0) == []
+    assert builder.retry(499 * MS) == []
+    (event,) = builder.retry(500 * MS)
+    assert_directions(event)
+    (event,) = builder.add(pixels_seen(0, POINTS, is_tags=True), 600 * MS)
+    assert_directions(event)
+    # One that /tf has is waited for, as the others of its message
+    for number, point in enumerate(POINTS, 3):
+        transforms.insert('camera', f'tag36h11:{number}', 0, se3.pose(np.eye(3), point))
+    (event,) = builder.add(pixels_seen(0, POINTS, is_tags=True), 700 * MS)
+    assert event.kinds is None
+    assert_allclose(event.points, se3.transform(CAMERA, POINTS))
+    assert builder.add(pixels_seen(MS, POINTS, is_tags=True), 700 * MS) == []
+
+
+def test_tags_that_tf_has_had_are_dropped_where_it_does_not_have_them_in_time():
+    transforms, dropped = TransformBuffer(), []
+    transforms.insert('base_link', 'camera', 0, CAMERA, is_static=True)
+    transforms.cameras['camera'] = PIXELS_CAMERA
+    transforms.insert('camera', 'tag_4', 0, CAMERA)
+    builder = EventBuilder(BaseFrame(InputSettings(), transforms), 0.5, 0.5, dropped.append)
+    assert builder.add(pixels_seen(0, POINTS, is_tags=True), 0) == []
+    assert builder.retry(500 * MS) == []
+    assert len(dropped) == 1
 
 
 def test_tags_are_those_of_the_sensor_that_a_parameter_names():

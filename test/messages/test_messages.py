@@ -455,6 +455,7 @@ def example_messages() -> dict[str, bytes]:
         detector.pose_array([(1.0, 2.0, 3.0)], 'camera'),
         detector.detections([detector.detection('7', 'post_3', np.eye(3))], 'camera'),
         detector.apriltags([('tag36h11', 5)], 'camera'),
+        detector.boxes([('lamp_5', (400.0, 200.0))], 'camera'),
         detector.aruco_markers(MARKERS, 'camera'),
         detector.aruco_markers(MARKERS, 'camera', package='aruco_interfaces'),
         detector.aruco_detection(MARKERS, 'camera', boards=['dock']),

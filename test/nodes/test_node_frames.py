@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from unittest.mock import Mock
 
+import detector_messages as detector
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from node_processes import running
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 from rclpy.serialization import serialize_message
+import ros_messages
 from sensor_msgs.msg import PointCloud2
 
 pytest.importorskip('tf2_msgs')
@@ -225,6 +227,23 @@ def test_the_nodes_own_transform_takes_no_other_ones_place():
         receive(serialize_message(TFMessage(transforms=[transform])))
     assert buffer.newest_ns('odom', 'base_link') == SECOND
     assert buffer.newest_ns('map', 'base_link') is None
+
+
+def test_a_camera_is_heard_and_one_that_is_not_calibrated_is_named():
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    buffer = TransformBuffer()
+    LiveTransforms(node, buffer, ('map', 'base_link'))
+    (receive,) = (
+        call.args[2]
+        for call in node.create_subscription.call_args_list
+        if call.args[1] == 'camera_info'
+    )
+    receive(ros_messages.serialise(detector.camera_info('/lens')))
+    receive(ros_messages.serialise(detector.camera_info('other', focal_lengths=(0.0, 0.0))))
+    assert list(buffer.cameras) == ['lens']
+    (logged,) = (call.args[0] for call in node.get_logger().warning.call_args_list)
+    assert "'/robot/camera_info': the camera of 'other' is not calibrated" in logged
 
 
 def test_a_second_localisation_on_tf_is_named(ros, tmp_path):

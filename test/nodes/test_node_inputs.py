@@ -356,6 +356,7 @@ DETECTIONS = {
     for message in (
         detector.detections([detector.detection('7')], 'camera'),
         detector.apriltags([('tag36h11', 7)], 'camera'),
+        detector.boxes([('lamp_7', (400.0, 200.0))], 'camera'),
         detector.isaac_apriltags([MARKER], 'camera'),
         detector.aruco_detection([MARKER], 'camera'),
         detector.aruco_markers([MARKER], 'camera'),
@@ -410,10 +411,10 @@ def test_what_else_a_topic_carries_is_answered_with_the_types_that_are_read():
     landmarks.check_publishers()
     assert landmarks.problem == (
         "'/landmarks' carries sensor_msgs/msg/LaserScan; PointCloud2, PointCloud, "
-        'AprilTagDetectionArray, PoseArray, Detection3DArray, ArucoDetection, ArucoMarkers, '
-        'LandmarkList, ObservationRangeBearing, ObservationRangeBeacon, LinktrackNodeframe2, '
-        'LinktrackNodeframe3, LinktrackAoaNodeframe0, BeaconDistance, beacon_distance, Ranging, '
-        'GenericRanging, DWRanging, UWBRanging or Range is needed'
+        'AprilTagDetectionArray, PoseArray, Detection3DArray, Detection2DArray, ArucoDetection, '
+        'ArucoMarkers, LandmarkList, ObservationRangeBearing, ObservationRangeBeacon, '
+        'LinktrackNodeframe2, LinktrackNodeframe3, LinktrackAoaNodeframe0, BeaconDistance, '
+        'beacon_distance, Ranging, GenericRanging, DWRanging, UWBRanging or Range is needed'
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.estimates import RangePower
+from slam_observer_ros.events import BEARING, ObservationEvent
 from slam_observer_ros.runs.health import of_ranges
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -56,6 +57,20 @@ def test_the_axis_is_that_of_the_sensor():
     left = np.array([0.0, 1.0, 0.0])
     found = replay(seen_ahead(CAMERA, 1.0, left), CAMERA).range_power
     assert len(of_ranges(found, is_depth=False)) == 1
+
+
+def test_directions_alone_say_nothing_of_ranges():
+    unit = [
+        replace(
+            event,
+            points=event.points / np.linalg.norm(event.points, axis=1)[:, None],
+            kinds=np.full(len(event.ids), BEARING),
+        )
+        if isinstance(event, ObservationEvent)
+        else event
+        for event in seen_ahead(CAMERA, 1.0)
+    ]
+    assert replay(unit, CAMERA).range_power is None
 
 
 def test_a_sensor_that_sees_all_around_has_no_axis():

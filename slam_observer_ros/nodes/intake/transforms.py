@@ -1,11 +1,11 @@
-"""What /tf has: transforms of others, live, and the odometry among them."""
+"""What /tf and CameraInfo have: transforms, the odometry among them, and cameras; live."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from slam_observer_ros.common.errors import MessageError, TransformError
@@ -13,13 +13,16 @@ from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import ALWAYS_NS, insert_transforms, TransformBuffer
+from slam_observer_ros.messages.detections import CAMERA_INFO, decode_camera_info
 from slam_observer_ros.messages.poses import decode_transforms
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.input_topic import take
-from slam_observer_ros.nodes.ros_interface import TFMessage
+from slam_observer_ros.nodes.ros_interface import message_class, TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 TF_QOS = QoSProfile(depth=100)
+CAMERA_TOPIC = 'camera_info'
+CAMERA_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -34,7 +37,7 @@ class SentTransforms(Protocol):
 
 
 class LiveTransforms:
-    """Listens to /tf and /tf_static; without tf2_msgs no transform is ever known.
+    """Listens to /tf, /tf_static and camera_info; without tf2_msgs no transform is ever known.
 
     Parameters
     ----------
@@ -64,6 +67,9 @@ class LiveTransforms:
         if TFMessage is not None:
             self._dynamic = self._subscribe('/tf', TF_QOS, is_static=False)
             self._subscribe('/tf_static', TF_STATIC_QOS, is_static=True)
+        node.create_subscription(
+            message_class(CAMERA_INFO), CAMERA_TOPIC, self._receive_camera, CAMERA_QOS, raw=True
+        )
 
     def read_waiting(self) -> None:
         """Take what has come on /tf: while the node was busy, it may be a lot."""
@@ -74,6 +80,16 @@ class LiveTransforms:
             if taken is None:
                 return
             self._dynamic.callback(taken[0])
+
+    def _receive_camera(self, raw: bytes) -> None:
+        try:
+            frame, camera = decode_camera_info(raw)
+        except MessageError as error:
+            topic = f"'{self._node.resolve_topic_name(CAMERA_TOPIC)}'"
+            finding = found('malformed_message', topic=topic, error=error)
+            self._log.warning(CAMERA_TOPIC, finding.text())
+            return
+        self._buffer.cameras[frame.lstrip('/')] = camera
 
     def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> Subscription:
         def receive(raw: bytes) -> None:
