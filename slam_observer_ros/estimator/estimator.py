@@ -160,20 +160,22 @@ class Estimator(Estimate):
         pose: FloatArray,
         covariance: FloatArray | None = None,
         stamp_ns: int | None = None,
+        map_name: str = '',
     ) -> None:
         """Move the robot to ``pose`` (4, 4), body to world; the map stays.
 
         It is where it was at ``stamp_ns``, nanoseconds, by default :attr:`stamp_ns`: the motion
         since is added if it is known (:meth:`knows_motion_since`). If the pose in a loaded map was
-        unknown, it is known now. ``covariance`` (6, 6) is as in :attr:`pose_covariance`; default
-        exact. Raise :exc:`ParameterError` if one of them can't be right; nothing is changed then.
+        unknown, it is known now; of several maps in that of ``map_name``. ``covariance`` (6, 6)
+        is as in :attr:`pose_covariance`; default exact. Raise :exc:`ParameterError` if one of them
+        can't be right; nothing is changed then.
         """
         pose = rigid(pose, covariance)
         self._timeline.catch_up()
         if stamp_ns is not None and self.knows_motion_since(stamp_ns):
             known = np.zeros((6, 6)) if covariance is None else covariance
             pose, covariance = self._timeline.moved_on(pose, known, stamp_ns)
-        self._placement.place(pose, covariance)
+        self._placement.place(pose, covariance, map_name)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.

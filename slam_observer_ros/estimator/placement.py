@@ -89,14 +89,18 @@ class Placement:
         else:  # in a map that does not grow there is nothing to carry into another one
             self.start(None)
 
-    def place(self, pose: FloatArray, covariance: FloatArray | None) -> None:
-        """Move the robot; if the pose in a loaded map was not known, it is now."""
+    def place(self, pose: FloatArray, covariance: FloatArray | None, map_name: str = '') -> None:
+        """Move the robot; if the pose in a loaded map was not known, it is now.
+
+        Of several maps it is that of ``map_name``; by default the pose does not say which one.
+        """
         self.was_placed = True
+        named = [known for known in self.localiser.maps if map_name and known.name == map_name]
         if self.localiser.is_localised:
             self.hypotheses.prune_to_best().set_pose(self._allowed(pose), covariance)
             self.localiser.doubt_pose()
         else:
-            self.start(pose, covariance)
+            self.start(pose, covariance, named[0] if named else None)
 
     def doubt(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Search about the present pose if it is too rough to match points without ids by it."""

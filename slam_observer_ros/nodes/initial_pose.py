@@ -192,7 +192,7 @@ class KeptPose:
             if not reason:
                 # It may have been moved a little meanwhile, as a pose given in RViz may be off.
                 covariance = stored.covariance + np.diag(GIVEN_POSE_STD**2)
-                self._estimator.set_pose(stored.pose, covariance)
+                self._estimator.set_pose(stored.pose, covariance, map_name=stored.map_name)
                 self._restored = stored
         except SlamObserverError as error:
             reason = str(error)
@@ -200,7 +200,8 @@ class KeptPose:
             self._logger.warning(f'the pose kept in pose_file is not used: {reason}')
             return
         x, y, z = stored.pose[:3, 3].tolist()
-        self._logger.info(f'the robot is where it was: ({x:.2f}, {y:.2f}, {z:.2f}) m')
+        where = f' in the map {stored.map_name}' if stored.map_name else ''
+        self._logger.info(f'the robot is where it was{where}: ({x:.2f}, {y:.2f}, {z:.2f}) m')
 
     def follow_odometry(self) -> None:
         """Let a restored pose move on as odometry has, once it is heard, and it has gone on."""
@@ -220,7 +221,7 @@ class KeptPose:
         s = self._estimator.settings
         noise = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
         moved = of_moved_pose(stored.covariance, stored.pose, motion, np.diag(noise**2 * age_s))
-        self._estimator.set_pose(stored.pose @ motion, moved, stamp_ns)
+        self._estimator.set_pose(stored.pose @ motion, moved, stamp_ns, stored.map_name)
         self._logger.info(f'by odometry the robot has moved {way_m:.2f} m since')
 
     def keep(self) -> None:
@@ -237,7 +238,9 @@ class KeptPose:
         self._stamp_ns = stamp_ns
         try:
             odometry = self._odometry.pose_until(stamp_ns or 0)
-            write_pose(self._path, StoredPose(pose, covariance, frame, time.time(), odometry))
+            name = estimator.map_name if len(estimator.loaded_maps) > 1 else ''
+            kept = StoredPose(pose, covariance, frame, time.time(), odometry, name)
+            write_pose(self._path, kept)
         except SlamObserverError as error:
             self._log.warning('pose_file', str(error))
 
@@ -249,6 +252,9 @@ class KeptPose:
             return f'it is {age_s:.0f} s old (pose_file_max_age)'
         if stored.frame_id != self._settings.map_frame:
             return f"it is in frame '{stored.frame_id}', not '{self._settings.map_frame}'"
+        names = [known.name for known in self._estimator.loaded_maps]
+        if stored.map_name and stored.map_name not in names:
+            return f"it is in the map '{stored.map_name}', which is not loaded"
         return ''
 
 
@@ -271,6 +277,7 @@ class StoredPose:
     frame_id: str
     time_s: float  # since 1970
     odometry: FloatArray | None = None  # (4, 4) the base in odom_frame then, if that is on /tf
+    map_name: str = ''  # of the map that it was in, where several were loaded
 
 
 def write_pose(path: Path, stored: StoredPose) -> None:
@@ -286,6 +293,8 @@ def write_pose(path: Path, stored: StoredPose) -> None:
     if stored.odometry is not None:
         R, x = stored.odometry[:3, :3], stored.odometry[:3, 3]
         content['odometry'] = [*x.tolist(), *so3.to_quaternion(R).tolist()]
+    if stored.map_name:
+        content['map'] = stored.map_name
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished_file(path) as file:
@@ -316,6 +325,7 @@ def read_pose(path: Path) -> StoredPose:
         str(content.get('frame')),
         float(time_s),
         odometry,
+        str(content.get('map', '')),
     )
 
 

@@ -16,6 +16,7 @@ from slam_observer_ros import Estimator, Settings
 from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.nodes import initial_pose
 from slam_observer_ros.nodes.initial_pose import (
     KeptPose,
@@ -83,6 +84,35 @@ def test_a_kept_pose_moves_on_as_odometry_has(kept, odometry, moved):
     kept.odometry.pose = odometry @ MOTION
     kept.part.follow_odometry()  # once is enough
     assert_allclose(kept.estimator.pose, POSE @ moved, atol=1e-9)
+
+
+def halls(*names):
+    ids, points = np.arange(4), np.array([[3, 0, 0], [4, 2, 0], [0, 3, 0], [-2, 1, 0]], float)
+    covariances = np.tile(1e-4 * np.eye(3), (4, 1, 1))
+    return [LandmarkMap(ids, points, covariances, 0 * ids, name=name) for name in names]
+
+
+def test_of_several_maps_the_robot_is_in_that_where_it_was(kept):
+    kept.estimator.load_map(halls('north', 'south'))
+    kept.estimator.set_pose(POSE, COVARIANCE, map_name='south')
+    kept.estimator.add(VelocityEvent(1, np.zeros(6)))
+    kept.estimator.release()
+    kept.part.keep()
+    assert read_pose(kept.path).map_name == 'south'
+    kept.estimator.load_map(halls('north', 'south'))
+    assert not kept.estimator.is_localised
+    kept.part.restore()
+    assert kept.estimator.is_localised
+    assert kept.estimator.map_name == 'south'
+    assert_allclose(kept.estimator.pose, POSE, atol=1e-9)
+
+
+def test_a_pose_in_a_map_that_is_not_there_any_more_is_not_used(kept):
+    write_pose(kept.path, StoredPose(POSE, COVARIANCE, 'map', 1e9, map_name='west'))
+    kept.estimator.load_map(halls('north', 'south'))
+    kept.part.restore()
+    assert not kept.estimator.is_localised
+    assert "it is in the map 'west', which is not loaded" in kept.log.warning.call_args.args[0]
 
 
 def test_a_pose_is_read_as_it_was_written(tmp_path):
