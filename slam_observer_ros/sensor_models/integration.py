@@ -183,12 +183,18 @@ class DelayEvidence:
         duration_s = to_s(end_ns - start_ns)
         centres_ns = start_ns - delay_ns, end_ns - delay_ns
         stamps, V = velocities.between(centres_ns[0] - reach_ns, end_ns)
-        if len(stamps) < 3 or stamps[0] == stamps[-1] or duration_s <= 0.0:
+        if len(stamps) < 2 or stamps[0] == stamps[-1] or duration_s <= 0.0:
             return
         axes = calibration.axes.pose
         V = V[:, axes]
         W = _weights(stamps, centres_ns[1], reach_ns, end_ns)
         W -= _weights(stamps, centres_ns[0], reach_ns, start_ns)
+        stated = variances[axes] / duration_s
+        is_noisy = stated > 0.0
+        stated = stated[is_noisy]
+        self._information += float((W.dot(V)[is_noisy] ** 2 / stated).sum()) / duration_s
+        if len(stamps) < 3:  # a single step may be a change, as of commands by key press
+            return
         in_force_s = _overlaps(stamps, *centres_ns) / NANOSECONDS_PER_SECOND
         period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) / NANOSECONDS_PER_SECOND
         # How much noise there is: as stated, or less where velocities differ less.
@@ -196,11 +202,7 @@ class DelayEvidence:
         self._used += 1
         self._steps[axes] += (steps - self._steps[axes]) / self._used
         found = 0.5 * (_PER_MEDIAN * self._steps[axes]) ** 2 * period_s
-        stated = variances[axes] / duration_s
-        is_noisy = stated > 0.0
-        stated = stated[is_noisy]
         share = float(np.minimum(found[is_noisy] / stated, 1.0).sum()) / period_s
-        self._information += float((W.dot(V)[is_noisy] ** 2 / stated).sum()) / duration_s
         self._noise += share * float(W.dot(W)) / duration_s
         self._pull += share * float(W.dot(in_force_s)) / duration_s
 
@@ -210,8 +212,9 @@ class DelayEvidence:
             return delay
         prior, posterior = initial_s**-2, delay.deviation**-2
         learnt = max(posterior - prior, 0.0)
-        true_share = max(1.0 - self._noise / self._information, 0.0)
-        pull = self._pull / self._information * learnt / posterior
+        information = max(self._information, self._noise)  # of which the noise is a share
+        true_share = 1.0 - self._noise / information
+        pull = self._pull / information * learnt / posterior
         left = initial_s * min(prior / posterior, 1.0) ** true_share
         variance = 1.0 / (prior + learnt * true_share) + (0.5 * pull) ** 2 + left**2
         deviation = min(math.sqrt(variance), initial_s)

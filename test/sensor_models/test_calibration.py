@@ -27,7 +27,9 @@ from slam_observer_ros.sensor_models.calibration import (
     MIN_DELAY_S,
     OF_VELOCITY,
 )
+from slam_observer_ros.sensor_models.integration import DelayEvidence
 from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 NO_BIAS = (0.0, 0.0, 0.0)
@@ -242,6 +244,26 @@ def test_the_velocity_that_is_reported_is_the_one_that_moves_the_pose():
         after = estimator.pose_at(estimator.stamp_ns + step_ns)
         moved = estimator.pose @ se3.exp(estimator.body_velocity * step_ns * 1e-9)
         np.testing.assert_allclose(after, moved, atol=1e-9)
+
+
+@pytest.mark.parametrize('first_s', [0.0, 0.05, 0.1])
+@pytest.mark.parametrize('change', [1e-3, 0.1])
+def test_what_a_command_by_key_press_changes_is_no_noise_that_passes_for_a_delay(first_s, change):
+    """A few motions have three of them within reach; these say little of all the others."""
+    history, evidence = VelocityHistory(10**9), DelayEvidence()
+    calibration = Calibration(FilterArrays(np.eye(4)), Settings(two_d_mode=True), PLANAR)
+    calibration.shift(np.array([*np.zeros(calibration.of_velocity - 1), 0.3]))
+    pressed_s = first_s + np.array([0.0, 0.3, 0.75, *np.arange(2.0, 20.0, 1.5)])
+    speeds = 0.3 * np.where(np.arange(len(pressed_s)) % 2, 1.0 + change, 1.0)
+    speeds[2:] += 0.3 * (np.arange(2, len(pressed_s)) % 2)
+    commands = np.outer(speeds, [0, 0, 1, 1, 0, 0])
+    pressed = [VelocityEvent(round(s * 1e9), V) for s, V in zip(pressed_s, commands, strict=True)]
+    for start_ns in range(0, 20 * 10**9, 10**8):
+        while pressed and pressed[0].stamp_ns <= start_ns:
+            history.append(pressed.pop(0))
+        evidence.add(history, calibration, np.full(6, 1e-4), start_ns, start_ns + 10**8)
+    found = CalibrationEstimate('velocity_delay', 0.46, 0.02, 's', stated=0.2)
+    assert evidence.corrected(found, 0.2).value == pytest.approx(0.46, abs=0.05)
 
 
 def test_at_constant_velocity_nobody_can_know_the_delay():
