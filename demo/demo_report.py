@@ -11,8 +11,8 @@ from rich.console import Console
 from slam_observer_ros.cli.console import table_of
 from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.figures import plot_configuration, plot_lyapunov
 from slam_observer_ros.evaluation.metrics import Decay, fit_decay, trajectory_errors
-from slam_observer_ros.evaluation.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.evaluation.trajectory import Trajectory
 
 CHECKED_S = 60.0  # simulated time at which the observer must have converged

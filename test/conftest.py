@@ -73,7 +73,7 @@ LONGEST = (
     'test_cli_replay',
     'test_replay_outputs',
     'test_report',
-    'test_plots',
+    'test_figures',
     'test_smoothing',
     'test_given_poses',
 )

@@ -1,14 +1,15 @@
-"""``slam-observer convert``: public data sets as recordings."""
+"""``slam-observer convert``: public data sets as recordings, poses of recordings as TUM files."""
 
 from __future__ import annotations
 
 import argparse
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.options import named_path
+from slam_observer_ros.cli.options import named, named_path
 from slam_observer_ros.cli.outputs import (
     add_force_option,
     check_inputs_are_kept,
@@ -17,6 +18,8 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
+from slam_observer_ros.common.findings import found
+from slam_observer_ros.evaluation.trajectory import write_tum
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.recording.data_sets import (
@@ -26,7 +29,12 @@ from slam_observer_ros.recording.data_sets import (
     MEASURES,
 )
 from slam_observer_ros.recording.graph_files import load_graph
+from slam_observer_ros.recording.opening import files_of
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.topics import pose_topic
 from slam_observer_ros.recording.writer import DataSet, write_data_set
+
+logger = logging.getLogger(__name__)
 
 GRAPH_PARAMETERS = """\
 # A graph in the plane: the second that a pose takes is only a name for its step.
@@ -42,9 +50,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command, and its description."""
     parser.description = (
         'Make an MCAP recording, with TwistStamped, PointCloud2 and the truth, '
-        'of a public data set.'
+        'of a public data set; or, by tum, a TUM file of the poses of a topic, such as the true '
+        'ones.'
     )
-    data_sets = parser.add_subparsers(dest='data_set', required=True, metavar='DATA-SET')
+    data_sets = parser.add_subparsers(dest='data_set', required=True, metavar='WHAT')
     starry_night = data_sets.add_parser(
         'starry-night', help='stereo camera and IMU moved by hand: dataset3.mat'
     )
@@ -95,6 +104,38 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
         )
         add_force_option(data_set)
+
+    tum = data_sets.add_parser('tum', help='poses of a topic of a recording, as evo reads them')
+    tum.add_argument('file', type=named_path, metavar='RECORDING', help='as replay reads it')
+    tum.add_argument('output', type=named_path, metavar='OUT.tum', help='TUM file to make')
+    tum.add_argument(
+        '--topic',
+        type=named,
+        metavar='TOPIC',
+        help='poses or odometry; by default the true poses, as replay finds them',
+    )
+    tum.add_argument(
+        '--base-frame',
+        type=named,
+        metavar='FRAME',
+        help='move poses that are of another frame to this one, by /tf_static',
+    )
+    add_force_option(tum)
+    tum.set_defaults(run=_run_tum)
+
+
+def _run_tum(args: argparse.Namespace) -> None:
+    """Write the poses of a topic."""
+    read = {f'the recording {args.file}': files_of(args.file)}
+    check_inputs_are_kept({'OUT.tum': args.output}, read)
+    check_outputs([args.output], args.force)
+    with Recording(args.file) as recording:
+        topic = pose_topic(recording.topics, args.topic)
+        trajectory = recording.trajectory(topic, args.base_frame or '')
+        if recording.warning:
+            logger.warning('%s', found('incomplete_recording', problem=recording.warning))
+    write_tum(trajectory, args.output)
+    print_table(str(args.output), {'topic': str(topic), 'poses': str(len(trajectory))})
 
 
 def _run_graph(args: argparse.Namespace) -> None:

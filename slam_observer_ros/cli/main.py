@@ -49,7 +49,6 @@ COMMANDS = {
     'tune': ('tune', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),
     'doctor': ('doctor', 'say what is installed, and what a node would hear'),
-    'compare': ('compare', 'put runs, gains and TUM files on one recording side by side'),
     'batch': ('batch', 'run many recordings with many settings'),
 }
 """The module of each command, and what it does; only the one that is given is imported."""

@@ -166,7 +166,7 @@ def _check(args: argparse.Namespace) -> None:
     print_table(str(args.file), values)
     if args.plot:
         # matplotlib takes half a second to import.
-        from slam_observer_ros.evaluation.map_plot import plot_map_check
+        from slam_observer_ros.evaluation.figures import plot_map_check
 
         too_few = looks.fitting == 0
         places = looks.poses[:, :3, 3]

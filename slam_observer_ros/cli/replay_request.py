@@ -1,4 +1,4 @@
-"""What a replay is asked for, whoever asks: replay itself, batch, compare and tune."""
+"""What a replay is asked for, whoever asks: replay itself, batch and tune."""
 
 from __future__ import annotations
 

@@ -241,7 +241,7 @@ def _record(simulation: Simulation, path: Path, force: bool) -> None:
 
 def _draw(simulation: Simulation, result: SimulatedRun, directory: Path, suffix: str) -> None:
     # matplotlib takes longer to import than the simulation
-    from slam_observer_ros.evaluation.simulation_plots import (
+    from slam_observer_ros.evaluation.figures import (
         plot_configuration,
         plot_lyapunov,
     )

@@ -1,26 +1,21 @@
-"""What is true of poses and landmarks; poses over time: their interpolation, and TUM files."""
+"""What is true of poses and landmarks; poses over time, between their stamps and in files."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
-from slam_observer_ros.common.files import read_lines, unfinished_file
+from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 
 MAX_GAP_NS = NANOSECONDS_PER_SECOND // 2
 """Truth is not interpolated between samples further apart than this."""
-
-_MAX_STAMP = 2**63
-"""Nanoseconds; as seconds, the year 2262 is not reached."""
 
 _TUM_HEADER = '# timestamp[s] x y z [m] qx qy qz qw\n'
 
@@ -180,87 +175,6 @@ def write_tum(trajectory: Trajectory, path: Path) -> Path:
     except OSError as error:
         raise EvaluationError(f"can't write {path}: {error.strerror}") from error
     return path
-
-
-def read_tum(path: Path) -> Trajectory:
-    """Read a TUM file, of whatever program, with poses in the order of time.
-
-    Numbers may be separated by spaces, tabs, commas or semicolons. A line of names may come first,
-    and say that ``qw`` comes before ``qx``. Stamps are seconds; such as no clock has are taken for
-    milliseconds, microseconds or nanoseconds. Raises an EvaluationError that names file and line
-    if it is none.
-    """
-    try:
-        lines = [(place, _words(line)) for place, line in enumerate(read_lines(path), 1)]
-    except OSError as error:
-        raise EvaluationError(f"can't read {path}: {error.strerror}") from error
-    has_w_first = any(_names_w_first(words) for _, words in lines)
-    lines = [(place, words) for place, words in lines if words and words[0][0] != '#']
-    if lines and len(lines[0][1]) == 8 and not any(map(_is_number, lines[0][1])):
-        lines.pop(0)  # names of columns
-    if not lines:
-        raise EvaluationError(f'{path}: no TUM file: there are no poses in it')
-    try:
-        rows = [_tum_row(place, words) for place, words in lines]
-        _check_order([place for place, _ in lines], [stamp for stamp, _ in rows])
-    except ValueError as error:
-        raise EvaluationError(f'{path}: no TUM file: {error}') from error
-    table = np.array([numbers for _, numbers in rows], dtype=np.float64).reshape(-1, 7)
-    if has_w_first:
-        table = table[:, [0, 1, 2, 4, 5, 6, 3]]
-    poses = se3.pose(so3.from_quaternion(table[:, 3:]), table[:, :3])
-    nanoseconds = _nanoseconds_of_unit([stamp for stamp, _ in rows])
-    stamps_ns = [int(stamp * nanoseconds) for stamp, _ in rows]
-    return Trajectory(np.array(stamps_ns, dtype=np.int64), poses)
-
-
-def _words(line: str) -> list[str]:
-    if ';' in line:  # by whose side a comma is one of decimals
-        line = line.replace(',', '.').replace(';', ' ')
-    return line.replace(',', ' ').split()
-
-
-def _names_w_first(words: Sequence[str]) -> bool:
-    """Return whether these are names of columns in which a quaternion begins with w."""
-    axes = [word[-1].lower() for word in words if word != '#'][4:]
-    return axes == ['w', 'x', 'y', 'z']
-
-
-def _is_number(word: str) -> bool:
-    try:
-        Decimal(word)
-    except ArithmeticError:
-        return False
-    return True
-
-
-def _tum_row(place: int, words: Sequence[str]) -> tuple[Decimal, list[float]]:
-    """Return stamp and numbers of a line; a ValueError if it is none."""
-    if len(words) != 8:
-        raise ValueError(f'line {place} has not 8 numbers')
-    try:
-        stamp, numbers = Decimal(words[0]), [float(word) for word in words[1:]]
-    except (ValueError, ArithmeticError) as error:
-        raise ValueError(f'line {place} has not 8 numbers: {error}') from error
-    if not stamp.is_finite() or not np.isfinite(numbers).all() or abs(stamp) >= _MAX_STAMP:
-        raise ValueError(f'line {place} has a number that is not finite, or no time')
-    if not any(numbers[3:]):
-        raise ValueError(f'line {place}: a quaternion is zero')
-    return stamp, numbers
-
-
-def _check_order(places: Sequence[int], stamps: Sequence[Decimal]) -> None:
-    for (before, stamp), (place, after) in pairwise(zip(places, stamps, strict=True)):
-        if after <= stamp:
-            what = 'the same stamp as' if after == stamp else 'an earlier stamp than'
-            raise ValueError(f'line {place} has {what} line {before}')
-
-
-def _nanoseconds_of_unit(stamps: Sequence[Decimal]) -> int:
-    """Return the nanoseconds of the unit of stamps, by how large they are."""
-    largest = max(map(abs, stamps), default=Decimal(0))
-    units = (NANOSECONDS_PER_SECOND, 1_000_000, 1_000, 1)
-    return next(unit for unit in units if largest * unit < _MAX_STAMP)
 
 
 def _seconds_text(stamp_ns: int) -> str:

@@ -16,6 +16,7 @@ from slam_observer_ros.common.errors import MessageError, RecordingError, Transf
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import Event, VelocityBlock
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import (
@@ -48,7 +49,13 @@ from slam_observer_ros.recording.sources import (
     RawMessage,
     Topic,
 )
-from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
+from slam_observer_ros.recording.topics import (
+    select_topics,
+    SelectedTopics,
+    TopicNames,
+    transform_topics,
+    TransformTopics,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -182,7 +189,7 @@ class Recording:
         stamp zero, which is counted in :attr:`unstamped`. Malformed messages are left out and
         counted in :attr:`malformed`, what was dropped in :attr:`dropped`; the first is logged.
         """
-        transforms = self._static_transforms(selected)
+        transforms = self._static_transforms(selected.transforms, selected.cameras)
         base_frame = BaseFrame(inputs, transforms)
         if selected.cameras and self.contents.missing_tags(selected, inputs.tag_frame_prefix):
             base_frame.expect_no_poses()
@@ -250,12 +257,32 @@ class Recording:
 
         Poses of another frame are moved to it by /tf_static, or left as they are, with a warning.
         """
-        poses = list(self._true_poses(selected.pose_truth))
+        topics = selected.pose_truth, selected.landmark_truth
+        return self._truth(*topics, selected.transforms, base_frame)
+
+    def trajectory(self, topic: Topic, base_frame: str = '') -> Trajectory:
+        """Read the poses of a topic, as those of :meth:`truth`.
+
+        A RecordingError says if there is none.
+        """
+        transforms = transform_topics(self.topics, (topic,))
+        truth = self._truth(topic, None, transforms, base_frame)
+        if not len(truth.stamps_ns):
+            raise RecordingError(f'{self.path}: no message of {topic.name} has a pose')
+        return Trajectory(truth.stamps_ns, truth.poses)
+
+    def _truth(
+        self,
+        pose_topic: Topic | None,
+        landmark_topic: Topic | None,
+        transforms: TransformTopics,
+        base_frame: str,
+    ) -> Truth:
+        poses = list(self._true_poses(pose_topic))
         base_in: dict[str, FloatArray] = {}
         if frames := other_frames(base_frame, poses):
-            transforms = self._static_transforms(selected)
-            base_in = base_in_frames(frames, base_frame, transforms)
-        landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)
+            base_in = base_in_frames(frames, base_frame, self._static_transforms(transforms))
+        landmarks = self._all_decoded(landmark_topic, decode_landmarks)
         return Truth.from_messages(poses, base_in, landmarks)
 
     def sensor_pose(
@@ -270,7 +297,7 @@ class Recording:
         if frame in ('', inputs.base_frame):
             return np.eye(4)
         try:
-            return self._static_transforms(selected).lookup(inputs.base_frame, frame, 0)
+            return self._static_transforms(selected.transforms).lookup(inputs.base_frame, frame, 0)
         except TransformError:
             return None
 
@@ -285,11 +312,13 @@ class Recording:
                 if pose is not None:
                     yield PoseBlock.of(pose)
 
-    def _static_transforms(self, selected: SelectedTopics) -> TransformBuffer:
+    def _static_transforms(
+        self, topics: TransformTopics, cameras: Sequence[Topic] = ()
+    ) -> TransformBuffer:
         transforms = TransformBuffer()
-        for raw in self._source.messages(selected.transforms.static):
+        for raw in self._source.messages(topics.static):
             self._insert(transforms, raw, is_static=True)
-        for topic in selected.cameras:
+        for topic in cameras:
             first = next(self._all_decoded(topic, lambda raw: decode_camera_info(raw.data)), None)
             if first is not None:
                 frame, camera = first

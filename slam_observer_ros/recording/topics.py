@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import logging
 from os.path import commonpath
 
@@ -133,6 +133,19 @@ def select_topics(
     if selected.pose_truth is None:
         _warn_of_unread_truth(used)
     return selected
+
+
+def pose_topic(topics: Sequence[Topic], name: str | None) -> Topic:
+    """Return the topic of that name, which has poses, or else that of the true poses.
+
+    Raises a RecordingError that lists the topics if there is none, or several could be meant.
+    """
+    role = replace(_of_true_poses(), option='--topic')
+    if name is not None:
+        return _named(topics, role, name)
+    used = [topic for topic in topics if topic.count > 0]
+    fitting = [t for t in used if _is_truth(t.name) and t.message_type in role.message_types]
+    return _required(_best(fitting, role), role, used)
 
 
 @dataclass(frozen=True, slots=True)

@@ -191,35 +191,14 @@ ACCURACY_ROWS = {
 }
 """Figures of ``--json`` that are in the table, their names there and their units."""
 
-TRAJECTORY_ROWS = {
-    'poses_compared': ('poses compared', ''),
-    'time_compared': ('share of the time', '%'),
-    'ate_max_m': ('position error, maximum', 'm'),
-    'ate_median_m': ('position error, median', 'm'),
-    'ate_std_m': ('position error, std. deviation', 'm'),
-    'drift': ('drift of the position', '%'),
-    'drift_rad_per_m': ('drift of the attitude', '°/m'),
-    'path_length_m': ('path length', 'm'),
-    'true_path_length_m': ('path length of the truth', 'm'),
-}
-"""Further figures of a trajectory beside others."""
-
 FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')
 """What runs are compared by."""
 
 
 def figure_text(key: str, figure: float, unit: str) -> str:
     """Return a figure as people read it: angles in degrees."""
-    return f'{number_text(key, figure)} {unit}'
-
-
-def number_text(key: str, figure: float) -> str:
-    """Return the number in the unit that people read: degrees, and shares in per cent."""
-    if isinstance(figure, int):
-        return str(figure)
-    if key.endswith(('_rad', '_rad_per_m')):
-        return significant(math.degrees(figure))
-    return significant(100.0 * figure if key in ('drift', 'time_compared') else figure)
+    number = math.degrees(figure) if key.endswith('_rad') else figure
+    return f'{significant(number)} {unit}'
 
 
 OUTLIERS = 0.02

@@ -84,7 +84,7 @@ def test_help_names_what_a_robot_needs_first_before_the_advanced_parameters(
         ('simulate --bias -1', "--bias: parameter 'initial_bias' takes a value ≥ 0"),
         ('simulate --landmarks 1.5', '--landmarks: parameter'),
         ('simulate --output run.bag', "recordings are .mcap files, so not 'run.bag'"),
-        ('convert', 'required: DATA-SET'),
+        ('convert', 'required: WHAT'),
         ('convert kitti a b.mcap', "invalid choice: 'kitti'"),
         ('convert mrclam . a.mcap', 'required: --robot'),
         ('convert mrclam . a.mcap --robot 1', 'not an MRCLAM data set'),
@@ -247,7 +247,7 @@ def test_what_only_the_command_line_needs_is_named_when_missing(tmp_path, absent
     recording = CHECKOUT / 'samples/sample.mcap'
     if absent == 'rosbags':  # which MCAP files do without
         recording = tmp_path / 'other.db3'
-        recording.touch()
+        recording.write_bytes(b'SQLite format 3\0')
     ended = subprocess.run(
         [sys.executable, program, 'replay', str(recording)],
         cwd=CHECKOUT,

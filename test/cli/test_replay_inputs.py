@@ -549,6 +549,14 @@ def test_true_poses_of_another_frame_are_moved_to_the_base(slam_observer, tmp_pa
     warning = "The true poses are of 'marker', and the estimated ones of 'base_link'"
     assert (warning in done.errors) != is_placed
     assert (done.json['ate_rmse_m'] < 1e-3) == is_placed
+    # As a TUM file they are the same.
+    tum = tmp_path / 'truth.tum'
+    written = slam_observer('convert', 'tum', path, tum, '--base-frame', 'base_link')
+    assert (warning in written.errors) != is_placed
+    poses = np.array([true_pose(stamp_ns) for stamp_ns in stamps_ns()])
+    assert_allclose(read_tum(tum).poses, poses if is_placed else poses @ marker, atol=1e-9)
+    slam_observer.succeed('convert', 'tum', path, tum, '--force')
+    assert_allclose(read_tum(tum).poses, poses @ marker, atol=1e-9)
 
 
 def test_the_base_frame_of_the_nodes_file_counts(slam_observer, tmp_path):

@@ -11,6 +11,7 @@ import recordings
 from tum_files import read_tum
 import yaml
 
+from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 
 
@@ -166,6 +167,40 @@ class TestOutputs:
         ended = slam_observer('replay', simulated, option, tmp_path / 'new')
         assert (ended.code, ended.output) == (2, '')
         assert f'nothing may be written to {tmp_path}' in ended.errors
+
+
+class TestTrajectoryOfATopic:
+    """What ``convert tum`` writes, for evo to compare with what ``replay --tum`` writes."""
+
+    def test_the_truth_gives_the_error_that_replay_prints(
+        self, slam_observer, simulated, tmp_path
+    ):
+        truth, run = tmp_path / 'truth.tum', tmp_path / 'run.tum'
+        found = slam_observer.succeed('replay', simulated, '--tum', run, '--json').json
+        written = slam_observer.succeed('convert', 'tum', simulated, truth)
+        assert '/ground_truth/pose' in written.output
+        errors = trajectory_errors(read_tum(run), read_tum(truth))
+        assert errors.ate_rmse_m == pytest.approx(found['ate_rmse_m'], abs=1e-12)
+        assert 'exists already' in slam_observer.fail('convert', 'tum', simulated, truth)
+
+    def test_any_topic_of_poses_can_be_named(self, slam_observer, simulated, tmp_path):
+        run, estimate = tmp_path / 'run.mcap', tmp_path / 'estimate.tum'
+        slam_observer.succeed('replay', simulated, '--mcap', run)
+        topic = ('--topic', 'observer_node/odometry')
+        slam_observer.succeed('convert', 'tum', run, estimate, *topic)
+        assert len(read_tum(estimate)) > 100
+
+    def test_what_has_no_poses_is_refused(self, slam_observer, simulated, tmp_path):
+        words = ('convert', 'tum', simulated, tmp_path / 'a.tum')
+        refused = slam_observer.fail(*words, '--topic', '/landmarks')
+        assert '/landmarks' in refused
+        assert 'geometry_msgs/msg/PoseStamped' in refused
+        assert '/ground_truth/pose' in slam_observer.fail(*words, '--topic', '/nothing')
+        without_truth = recordings.write_events(tmp_path / 'run.mcap', recordings.events())
+        refused = slam_observer.fail('convert', 'tum', without_truth, tmp_path / 'a.tum')
+        assert 'no true pose topic' in refused
+        assert '--topic names another' in refused
+        assert not (tmp_path / 'a.tum').exists()
 
 
 class TestSmoothing:

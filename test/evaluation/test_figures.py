@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.common.errors import EvaluationError
-from slam_observer_ros.evaluation import simulation_plots
+from slam_observer_ros.evaluation import figures
 from slam_observer_ros.evaluation.drawing import (
     BLACK,
     BLUE,
@@ -63,9 +63,7 @@ def rgb(colour: str) -> int:
 
 def test_lyapunov_function(tmp_path: Path) -> None:
     values = np.append(-0.2 * SECONDS[:-1], -np.inf)
-    path = simulation_plots.plot_lyapunov(
-        tmp_path / 'lyapunov.png', SECONDS, values, Decay(-0.2, 0.0)
-    )
+    path = figures.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, values, Decay(-0.2, 0.0))
     assert {rgb(PALE_BLUE), rgb(BLACK)} <= colours(path)
 
 
@@ -73,17 +71,17 @@ def test_the_line_that_is_fitted_lies_on_the_lyapunov_function(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     saved: list[Figure] = []
-    monkeypatch.setattr(simulation_plots, 'save', lambda figure, _path: saved.append(figure))
+    monkeypatch.setattr(figures, 'save', lambda figure, _path: saved.append(figure))
     values = 3.0 - 0.2 * SECONDS
     decay = fit_decay(SECONDS, 10.0**values, 0.0)
-    simulation_plots.plot_lyapunov(tmp_path / 'a.png', SECONDS, values, decay)
+    figures.plot_lyapunov(tmp_path / 'a.png', SECONDS, values, decay)
     level, line = (np.asarray(drawn.get_ydata()) for drawn in saved[0].axes[0].lines)
     assert line == pytest.approx(level[: len(line)])
     assert len(line) > 190
 
 
 def test_lyapunov_function_that_is_zero_throughout(tmp_path: Path) -> None:
-    path = simulation_plots.plot_lyapunov(
+    path = figures.plot_lyapunov(
         tmp_path / 'zero.png', SECONDS, np.full(200, -np.inf), Decay(-0.2, 0.0)
     )
     assert path.stat().st_size > 0
@@ -92,9 +90,7 @@ def test_lyapunov_function_that_is_zero_throughout(tmp_path: Path) -> None:
 def test_configuration(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
     tracks = LANDMARKS + np.exp(-0.3 * SECONDS)[:, None, None]
     tracks[:20, 1] = np.nan
-    path = simulation_plots.plot_configuration(
-        tmp_path / 'paths.png', estimate, truth, tracks, LANDMARKS
-    )
+    path = figures.plot_configuration(tmp_path / 'paths.png', estimate, truth, tracks, LANDMARKS)
     assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
 
 
@@ -103,13 +99,13 @@ def test_legend_of_a_configuration_covers_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, height_m: float
 ) -> None:
     saved: list[Figure] = []
-    monkeypatch.setattr(simulation_plots, 'save', lambda figure, _path: saved.append(figure))
+    monkeypatch.setattr(figures, 'save', lambda figure, _path: saved.append(figure))
     poses = se3.exp(SECONDS[:, None] * np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0]))
     poses[:, :3, 3] += [0.0, -5.0, min(height_m, 2.0)]
     circle = Trajectory((SECONDS * 1e9).astype(np.int64), poses)
     points = LANDMARKS + np.array([0.0, 0.0, height_m]) * np.array([[1.0], [-1.0], [1.0], [-1.0]])
     tracks = np.tile(points, (200, 1, 1))
-    simulation_plots.plot_configuration(tmp_path / 'a.png', circle, circle, tracks, points)
+    figures.plot_configuration(tmp_path / 'a.png', circle, circle, tracks, points)
     (figure,) = saved
     figure.draw_without_rendering()
     (legend,) = figure.legends
@@ -130,23 +126,21 @@ def test_a_figure_is_of_the_kind_of_its_suffix_and_the_same_each_time(
 ) -> None:
     start = {'png': b'\x89PNG', 'svg': b'<?xml', 'pdf': b'%PDF'}[suffix]
     path = tmp_path / f'lyapunov.{suffix}'
-    first, second = (
-        simulation_plots.plot_lyapunov(path, SECONDS, -SECONDS).read_bytes() for _ in range(2)
-    )
+    first, second = (figures.plot_lyapunov(path, SECONDS, -SECONDS).read_bytes() for _ in range(2))
     assert first.startswith(start)
     assert first == second
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match='absent'):
-        simulation_plots.plot_lyapunov(tmp_path / 'absent' / 'a.png', SECONDS, -SECONDS)
+        figures.plot_lyapunov(tmp_path / 'absent' / 'a.png', SECONDS, -SECONDS)
 
 
 def test_matplotlibs_settings_and_backend_stay_as_they_were(tmp_path: Path) -> None:
     before = dict(mpl.rcParams)
-    simulation_plots.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, -SECONDS)
+    figures.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, -SECONDS)
     assert dict(mpl.rcParams) == before
-    module = 'slam_observer_ros.evaluation.simulation_plots'
+    module = 'slam_observer_ros.evaluation.figures'
     program = f"import sys, {module}; print('matplotlib.pyplot' in sys.modules)"
     result = subprocess.run(
         [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60

@@ -1,4 +1,4 @@
-"""Figures of a simulation: those of the paper."""
+"""Figures: the paper's of a simulation, and of a map where one look finds the robot."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.evaluation.drawing import (
     BLACK,
     END,
+    GREEN,
     is_flat,
     LANDMARKS,
     legend_below,
+    ORANGE,
     PALE_BLUE,
     PATH,
+    RED,
     save,
     START,
     STYLE,
@@ -147,3 +150,38 @@ def _space_view(figure: Figure) -> Any:
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color('white')
     return axes
+
+
+@mpl.rc_context(STYLE)
+def plot_map_check(
+    path: Path,
+    landmarks: FloatArray,
+    places: FloatArray,
+    are_found: BoolArray,
+    see_too_few: BoolArray,
+    another: FloatArray | None,
+) -> Path:
+    """Draw landmarks (n, 3), and places (q, 3) by what a look from there says; return the path.
+
+    ``another`` (3,) is where one more landmark would do, or None.
+    """
+    figure = Figure(figsize=(7.0, 7.0))
+    axes = figure.subplots()
+    kinds = (
+        (are_found, GREEN, 'found by one look'),
+        (see_too_few & ~are_found, '#BBBBBB', 'too few in view'),
+        (~are_found & ~see_too_few, ORANGE, 'fits elsewhere, too'),
+    )
+    size = float(np.clip(9000.0 / max(len(places), 1), 4.0, 60.0))
+    for is_kind, colour, label in kinds:
+        if is_kind.any():
+            x, y = places[is_kind, :2].T
+            label = f'{label} ({is_kind.mean():.0%})'
+            axes.scatter(x, y, s=size, c=colour, marker='s', alpha=0.6, lw=0.0, label=label)
+    axes.plot(*landmarks[:, :2].T, 'o', color=BLACK, markersize=3, zorder=3, label='landmarks')
+    if another is not None:
+        axes.plot(*another[:2], color=RED, marker='*', markersize=14, ls='none', label='one more')
+    axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal')
+    axes.set_title('Where one look finds the robot')
+    legend_below(figure, axes, columns=3)
+    return save(figure, path)
