@@ -11,7 +11,13 @@ import numpy as np
 
 from slam_observer_ros.cli.calibration_stated import COMMON_SCALE, Found, trades
 from slam_observer_ros.cli.held_out import judge, Judged, Material, SURE
-from slam_observer_ros.cli.noise_tuning import NoiseKind, of_points, scaled, search_noise
+from slam_observer_ros.cli.noise_search import (
+    kinds_of,
+    NoiseFactor,
+    of_points,
+    scaled,
+    search_noise,
+)
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -179,7 +185,7 @@ class Finder:
                 settings, velocity_delay=0.0, velocity_delay_stddev=min(delay.deviation, 0.1)
             )
         noise = [] if keeps_noise else self._noise(settings)
-        settings = scaled(settings, [kind for kind, *_ in noise], [log for _, log, _ in noise])
+        settings = scaled(settings, [one.kind for one in noise], [one.log for one in noise])
         estimator, _ = self._run(settings)
         # A filter seems to know what only shows where it has linearised: a common scale.
         smoothed = estimator.smooth()
@@ -217,7 +223,7 @@ class Finder:
         (_, of_range), (_, of_depth) = (
             self._run(replace(settings, range_is_depth=is_depth)) for is_depth in (False, True)
         )
-        gain, deviation = growth(of_range, of_depth)
+        gain, deviation = growth([of_range], [of_depth])
         if 'range_is_depth' not in self._kept and abs(gain) > SURE * deviation:
             settings = replace(settings, range_is_depth=gain > 0.0)
         return settings, (gain, deviation)
@@ -252,13 +258,10 @@ class Finder:
             stated=prior_s,
         )
 
-    def _noise(self, settings: Settings) -> list[tuple[NoiseKind, float, float]]:
-        """Return the kinds of noise of points, with ln of their most likely factors, ± so much."""
-        kinds, found = search_noise(
-            [self._material.likelihood], settings, of_points(settings), self._advance
-        )
-        logs, deviations = found.log_factors.tolist(), found.deviations.tolist()
-        return list(zip(kinds, logs, deviations, strict=True))
+    def _noise(self, settings: Settings) -> list[NoiseFactor]:
+        """Return the most likely noise of points."""
+        likelihoods = [self._material.likelihood]
+        return search_noise(likelihoods, settings, of_points(settings), self._advance)
 
     def _part(
         self, part: CalibrationEstimate, delay: CalibrationEstimate | None
@@ -271,6 +274,17 @@ class Finder:
         names = [entry.name for entry in OF_VELOCITY]
         noise = part.value * self._motion.noise_share[names.index(part.name)]
         return replace(part, deviation=min(math.hypot(part.deviation, noise), part.stated))
+
+
+def find_noise(
+    materials: Sequence[Material], settings: Settings, advance: Callable[[], None]
+) -> Found:
+    """Return the noise of motion and points that recordings show together, and nothing else."""
+    likelihoods = [material.likelihood for material in materials]
+    noise = search_noise(likelihoods, settings, kinds_of(settings), advance)
+    if not noise:
+        raise UsageError('no noise figure has an effect: messages state all covariances')
+    return Found([], [], settings.range_is_depth, None, noise, [], [])
 
 
 def delayed(material: Material, delay_s: float) -> Material:
@@ -316,7 +330,7 @@ def _may_be_depth(material: Material) -> bool:
     return bool(np.mean(np.concatenate(behind)) <= MAX_BEHIND)
 
 
-def growth(before: Likelihood, after: Likelihood) -> tuple[float, float]:
-    """Return by how much a log likelihood grows, and the deviation of that."""
-    verdict = judge([Judged(before, None, None)], [Judged(after, None, None)])
+def growth(before: Sequence[Likelihood], after: Sequence[Likelihood]) -> tuple[float, float]:
+    """Return by how much the log likelihood of recordings grows, and the deviation of that."""
+    verdict = judge(*([Judged(one, None, None) for one in each] for each in (before, after)))
     return verdict.gain, verdict.gain_deviation

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_observer_ros.cli.noise_tuning import certainty, NoiseKind, of_motion, rounded, scaled
+from slam_observer_ros.cli.noise_search import NoiseFactor, of_motion, rounded, scaled
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor
 from slam_observer_ros.geometry import so3
@@ -124,7 +124,7 @@ class Found:
     trades: list[Trade]
     range_is_depth: bool
     depth_gain: tuple[float, float] | None  # of depth over range; None if it can't be
-    noise: list[tuple[NoiseKind, float, float]]  # of points: ln factor and its deviation
+    noise: list[NoiseFactor]  # of points; where it alone is looked for, of motion, too
     factors: list[MotionFactor]
     too_noisy: list[str]  # scales of velocities that were not looked for
 
@@ -193,7 +193,7 @@ def state_found(
 
 def with_noise(stated: Stated, found: Found, states_motion: bool) -> Stated:
     """Return the same with the noise that was found; of motion where messages state none."""
-    noise = [(kind, log, certainty(log, deviation)) for kind, log, deviation in found.noise]
+    noise = list(found.noise)
     factors = {part.name: part for part in found.factors} if states_motion else {}
     for kind in of_motion(stated.settings):
         part = factors.get(kind.name)
@@ -201,18 +201,18 @@ def with_noise(stated: Stated, found: Found, states_motion: bool) -> Stated:
             continue
         log = math.log(part.factor)
         if abs(log) > max(OFF * part.deviation, CLEARLY_NOISIER):
-            noise.append((kind, log, certainty(log, part.deviation)))
-    kinds = [kind for kind, *_ in noise]
-    settings = scaled(stated.settings, kinds, [log for _, log, _ in noise])
+            noise.append(NoiseFactor(kind, log, part.deviation))
+    kinds = [one.kind for one in noise]
+    settings = scaled(stated.settings, kinds, [one.log for one in noise])
     names = [name for kind in kinds for name in kind.parameters]
     figures: Values = {name: rounded(getattr(settings, name)) for name in names}
     settings = replace(settings, **figures)
     groups = [
         (
-            f'Noise of {kind.name}: {text} what it was',
-            {name: getattr(settings, name) for name in kind.parameters},
+            f'Noise of {one.kind.name}: {one} what it was',
+            {name: getattr(settings, name) for name in one.kind.parameters},
         )
-        for kind, _, text in noise
+        for one in noise
     ]
     return replace(stated, settings=settings, groups=[*stated.groups, *groups])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
@@ -10,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.cli.options import add_settings_options, named_path
-from slam_observer_ros.cli.outputs import add_force_option
-from slam_observer_ros.cli.replay_request import add_input_options, ReplayRequest, select_inputs
+from slam_observer_ros.cli.replay_request import ReplayRequest, select_inputs
 from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
@@ -25,7 +22,6 @@ from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.runs.accuracy import Likelihood, LikelihoodRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
 
 BLOCKS = 20
 """Parts of a recording in time by which it is judged whether a gain may be chance."""
@@ -265,29 +261,3 @@ def check_improvement(verdict: Verdict) -> None:
     """Raise an IncompleteError if what was held out does not confirm what was found."""
     if verdict.objection:
         raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
-
-
-def add_material_options(
-    parser: argparse.ArgumentParser, trained_on: str, *out_flags: str
-) -> None:
-    """Add what is held out beside what is ``trained_on``, and the parameter file that results."""
-    parser.add_argument(
-        '--hold-out',
-        action='append',
-        default=[],
-        type=named_path,
-        metavar='RECORDING',
-        help=f'hold this one out, and {trained_on}; may be given several times',
-    )
-    outputs = parser.add_argument_group('outputs')
-    outputs.add_argument(
-        *out_flags,
-        type=named_path,
-        metavar='FILE',
-        help='parameter file to write if it is an improvement',
-    )
-    outputs.add_argument('--json', action='store_true', help='print one JSON object')
-    add_force_option(parser)
-    add_input_options(parser)
-    add_settings_options(parser, InputSettings)
-    parser.set_defaults(smooth=False, load_map=None)

@@ -1,4 +1,4 @@
-"""What a replay is asked for, whoever asks: replay itself, batch and tune."""
+"""What a replay is asked for, whoever asks: replay itself, batch and calibrate."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class ReplayRequest:
 
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that of topics and inputs, which tune has, too."""
+    """Add the options that of topics and inputs, which calibrate has, too."""
     landmarks, ambiguous = (
         ', '.join(short_names('landmarks', is_ambiguous)) for is_ambiguous in (False, True)
     )

@@ -27,7 +27,7 @@ READ = [
     ('replay', 'run.mcap', '--load-map', '{}.yaml'),
     ('replay', 'folder'),
     ('convert', 'tum', '{}.mcap', 'out.tum'),
-    ('tune', '{}.bag'),
+    ('calibrate', '{}.bag', '--only', 'noise'),
     ('map', 'convert', '{}.csv', 'out.yaml'),
     ('map', 'convert', '{}.yaml', 'out.yaml'),
     ('map', 'convert', '{}.json', 'out.yaml'),
@@ -85,7 +85,7 @@ def test_an_output_that_links_to_itself_is_refused(slam_observer, recording, opt
         ('replay', 'run.mcap', '--base-frame', ''),
         ('convert', 'tum', '', 'out.tum'),
         ('convert', 'tum', 'run.mcap', ''),
-        ('tune', 'run.mcap', '--hold-out', ''),
+        ('calibrate', 'run.mcap', '--hold-out', ''),
         ('batch', '', '--out', 'out'),
         ('batch', 'run.mcap', '--out', ''),
         ('map', 'convert', '', 'out.yaml'),
@@ -131,8 +131,8 @@ def test_what_is_in_the_way_of_a_batch_is_said_before_the_first_run(
         ('replay', 'run.mcap', '--tum', 'link.png'),
         ('replay', 'run.mcap', '--mcap', 'run.mcap'),
         ('convert', 'tum', 'run.mcap', 'link.png'),
-        ('tune', 'run.mcap', '--out', 'link.png'),
-        ('tune', 'other.mcap', '--hold-out', 'run.mcap', '--out', 'run.mcap'),
+        ('calibrate', 'run.mcap', '--only', 'noise', '--out', 'link.png'),
+        ('calibrate', 'other.mcap', '--hold-out', 'run.mcap', '--out', 'run.mcap'),
         ('convert', 'starry-night', 'run.mcap', 'run.mcap'),
         ('convert', 'graph', 'run.yaml', 'run.mcap'),
         ('map', 'convert', 'run.mcap', 'link.png'),
@@ -154,8 +154,9 @@ def test_a_folder_of_figures_is_no_other_output(slam_observer, tmp_path, monkeyp
     assert not Path('a.mcap').exists()
 
 
-def test_what_is_held_out_is_read_before_the_search(slam_observer, recording, monkeypatch):
-    monkeypatch.setattr('slam_observer_ros.cli.noise_tuning.most_likely', None)
-    words = ('tune', recording, '--hold-out')
+@pytest.mark.parametrize('only', [(), ('--only', 'noise')])
+def test_what_is_held_out_is_read_before_the_search(slam_observer, recording, monkeypatch, only):
+    monkeypatch.setattr('slam_observer_ros.cli.calibrate._found', None)
+    words = ('calibrate', recording, *only, '--hold-out')
     assert 'nothing.mcap: no such file' in slam_observer.fail(*words, 'nothing.mcap')
     assert 'a recording is given twice' in slam_observer.fail(*words, SAMPLE)

@@ -1,4 +1,4 @@
-"""Tuning: it finds the noise that a recording was made with, and claims no more than holds."""
+"""Noise alone: what a recording was made with is found, and no more is claimed than holds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from slam_observer_ros.cli.held_out import judge, Judged
-from slam_observer_ros.cli.noise_tuning import (
+from slam_observer_ros.cli.noise_search import (
     kinds_of,
     most_likely,
     remembered,
@@ -25,6 +25,7 @@ from slam_observer_ros.simulation import Scenario, Simulation
 
 START_NS = 1_000_000_000
 TURN_NOISE, DRIVE_NOISE, POINT_NOISE_M = 0.03, 0.02, 0.05
+ONLY = ('--only', 'noise')
 MODEL = ('--set', 'observation_model=cartesian', '--set', 'angular_bias_stddev=[0,0,0]')
 MODELS = next(row.choices for row in table(Settings) if row.name == 'observation_model')
 TRUE_NOISE = {
@@ -63,15 +64,18 @@ def first(value):
 @pytest.mark.timeout(500)  # it replays a minute some eighty times
 def test_noise_that_was_stated_wrong_is_found(slam_observer, tmp_path):
     recording, other = (simulated(tmp_path / f'{seed}.mcap', seed) for seed in (1, 2))
-    out = tmp_path / 'tuned.yaml'
+    out = tmp_path / 'found.yaml'
     wrong = ('--set', 'point_noise=0.2', '--set', 'angular_velocity_noise=[0.01,0.01,0.01]')
     options = (*MODEL, *wrong, '--out', out, '--json')
-    found = slam_observer.succeed('tune', recording, '--hold-out', other, *options).json
-    assert set(found['tuned']) == set(TRUE_NOISE)
+    ended = slam_observer.succeed('calibrate', recording, *ONLY, '--hold-out', other, *options)
+    found = ended.json
+    assert set(found['parameters']) == set(TRUE_NOISE)
     for name, true in TRUE_NOISE.items():
-        assert first(found['tuned'][name]) == pytest.approx(true, rel=0.35), name
-    deviations = found['log_factor_deviations']
+        assert first(found['parameters'][name]) == pytest.approx(true, rel=0.35), name
+    deviations = {name: deviation for name, (_, deviation) in found['noise_log_factors'].items()}
     assert deviations['points'] < deviations['driving']
+    assert list(found['recordings']) == [str(recording)]
+    assert (found['calibration'], found['trades']) == ({}, [])
     before, after = found['held_out']['log_likelihood']
     assert after > before
     assert 0.5 < found['held_out']['anees'][1] < 2.0
@@ -79,9 +83,9 @@ def test_noise_that_was_stated_wrong_is_found(slam_observer, tmp_path):
     text = out.read_text()
     written = yaml.safe_load(text)['/**']['ros__parameters']
     assert written['observation_model'] == 'cartesian'
-    assert written['point_noise'] == found['tuned']['point_noise']
+    assert written['point_noise'] == found['parameters']['point_noise']
     assert recording.name in text
-    assert '# points: × ' in text
+    assert '# Noise of points: × ' in text
     replayed = slam_observer.succeed('replay', other, '--config', out, '--json').json
     assert replayed['settings']['point_noise'] == written['point_noise']
     assert replayed['configuration_anees'] == pytest.approx(found['held_out']['anees'][1])
@@ -89,20 +93,20 @@ def test_noise_that_was_stated_wrong_is_found(slam_observer, tmp_path):
 
 @pytest.mark.timeout(500)
 def test_what_holds_no_further_is_no_improvement(slam_observer, tmp_path):
-    recording, out = simulated(tmp_path / 'run.mcap', 1), tmp_path / 'tuned.yaml'
+    recording, out = simulated(tmp_path / 'run.mcap', 1), tmp_path / 'found.yaml'
     right = [
         word
         for name, value in TRUE_NOISE.items()
         for word in ('--set', f'{name}={[value] * 3 if "velocity" in name else value}')
     ]
-    ended = slam_observer('tune', recording, *MODEL, *right, '--out', out)
+    ended = slam_observer('calibrate', recording, *ONLY, *MODEL, *right, '--out', out)
     assert ended.code == 4
     assert 'no improvement: on what was held out' in ended.errors
     assert 'held out' in ended.output
     assert not out.exists()
 
 
-def test_what_can_not_be_tuned_is_refused(slam_observer, tmp_path):
+def test_what_noise_can_not_be_found_by_is_refused(slam_observer, tmp_path):
     path = tmp_path / 'run.mcap'
     point = np.array([[1.0, 0.0, 0.0]])
     with RecordingWriter(path) as writer:
@@ -110,8 +114,27 @@ def test_what_can_not_be_tuned_is_refused(slam_observer, tmp_path):
             stamp_ns = START_NS + number * 100_000_000
             writer.write_event(VelocityEvent(stamp_ns, np.zeros(6)))
             writer.write_event(ObservationEvent(stamp_ns, np.array([-1]), point))
-    assert 'needs landmarks with ids' in slam_observer.fail('tune', path)
-    assert 'riccati' in slam_observer.fail('tune', path, '--gains', 'constant')
+    assert 'needs landmarks with ids' in slam_observer.fail('calibrate', path, *ONLY)
+    assert 'riccati' in slam_observer.fail('calibrate', path, *ONLY, '--gains', 'constant')
+    together = slam_observer.fail('calibrate', path, *ONLY, '--keep-noise')
+    assert 'not allowed with argument' in together
+
+
+@pytest.mark.timeout(500)
+def test_noise_is_found_of_several_recordings_and_a_calibration_of_one(slam_observer, tmp_path):
+    recordings = [simulated(tmp_path / f'{seed}.mcap', seed) for seed in (1, 2)]
+    one_drive = slam_observer.fail('calibrate', *recordings)
+    assert 'give several recordings to --only noise' in one_drive
+    motion = [
+        word
+        for name in ('angular_velocity', 'linear_velocity', 'angular_scale', 'linear_scale')
+        for word in ('--set', f'{name}_noise=[0,0,0]')
+    ]
+    options = (*MODEL, *motion, '--set', 'point_noise=0.2', '--json')
+    found = slam_observer.succeed('calibrate', *recordings, *ONLY, *options).json
+    assert list(found['recordings']) == list(map(str, recordings))
+    assert list(found['parameters']) == ['point_noise']
+    assert found['parameters']['point_noise'] < 0.2
 
 
 def test_figures_of_a_kind_keep_their_proportions():
@@ -129,7 +152,7 @@ def test_figures_of_a_kind_keep_their_proportions():
 
 
 @pytest.mark.parametrize('model', MODELS)
-def test_every_model_of_observations_has_figures_to_tune(model):
+def test_every_model_of_observations_has_figures_to_find(model):
     kinds = kinds_of(Settings(observation_model=model))
     figures = [name for kind in kinds for name in kind.parameters]
     assert len(figures) > 2
@@ -143,7 +166,7 @@ def test_the_search_finds_the_maximum_and_how_sharp_it_is():
     objective = remembered(lambda x: -0.5 * float((np.array(x) - best) @ H @ (np.array(x) - best)))
     assert without_effect(objective, 3) == [2]
     found = most_likely(remembered(lambda x: objective(np.array([*x, 0.0]))), 2)
-    assert found.log_factors == pytest.approx(best[:2], abs=0.05)
+    assert found.logs == pytest.approx(best[:2], abs=0.05)
     expected = np.sqrt(np.diagonal(np.linalg.inv(H[:2, :2])))
     assert found.deviations == pytest.approx(expected, rel=0.01)
 

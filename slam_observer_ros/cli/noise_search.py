@@ -1,4 +1,4 @@
-"""The most likely noise figures, and nothing else: a factor for each kind of error.
+"""The most likely noise figures: a factor for each kind of error.
 
 Figures of one kind keep their proportions: how much of an error grows with the speed or with the
 range, and along which axis it is, a recording seldom shows. One that is zero stays zero.
@@ -117,16 +117,32 @@ Objective = Callable[[FloatArray], float]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Factors:
     """Logarithms (n,) of the most likely factors.
 
     ``deviations`` (n,) are by the curvature of the log likelihood, where all others are unknown,
     too; infinite where it has no maximum there.
     """
 
-    log_factors: FloatArray
+    logs: FloatArray
     deviations: FloatArray
-    log_likelihood: float
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseFactor:
+    """By which factor the noise of a kind is another than stated: its logarithm, ± so much."""
+
+    kind: NoiseKind
+    log: float
+    deviation: float
+
+    def __str__(self) -> str:
+        """Return the factor and its interval of 95 % as text."""
+        factor = math.exp(self.log)
+        if not math.isfinite(self.deviation):
+            return f'× {factor:.2g}, but the recording says little of it'
+        low, high = (math.exp(self.log + sign * 2.0 * self.deviation) for sign in (-1, 1))
+        return f'× {factor:.2g} ({low:.2g} to {high:.2g})'
 
 
 def without_effect(objective: Objective, n: int) -> list[int]:
@@ -136,10 +152,10 @@ def without_effect(objective: Objective, n: int) -> list[int]:
     return [i for i in range(n) if abs(objective(steps[i]) - nominal) < NO_EFFECT]
 
 
-def most_likely(objective: Objective, n: int) -> Found:
+def most_likely(objective: Objective, n: int) -> Factors:
     """Return the maximum of a log likelihood over the logarithms of n factors, from 1 on."""
     if not n:
-        return Found(np.zeros(0), np.zeros(0), objective(np.zeros(0)))
+        return Factors(np.zeros(0), np.zeros(0))
     simplex = np.vstack([np.zeros(n), FIRST_STEP * np.eye(n)])
     result = optimize.minimize(
         lambda x: -objective(x),
@@ -154,7 +170,7 @@ def most_likely(objective: Objective, n: int) -> Found:
         },
     )
     best = np.asarray(result.x, dtype=np.float64)
-    return Found(best, _deviations(objective, best), objective(best))
+    return Factors(best, _deviations(objective, best))
 
 
 def _deviations(objective: Objective, x: FloatArray) -> FloatArray:
@@ -202,8 +218,8 @@ def search_noise(
     settings: Settings,
     kinds: Sequence[NoiseKind],
     advance: Callable[[], None],
-) -> tuple[list[NoiseKind], Found]:
-    """Return the kinds of noise that have an effect, and their most likely factors.
+) -> list[NoiseFactor]:
+    """Return the most likely factors of the kinds of noise that have an effect.
 
     ``trained_on`` give the likelihood of each recording, and ``advance`` is called at each step.
     Raises a UsageError if nothing is seen twice.
@@ -220,9 +236,9 @@ def search_noise(
 
     idle = without_effect(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
     effective = [kind for number, kind in enumerate(kinds) if number not in idle]
-    return effective, most_likely(
-        remembered(lambda x: log_likelihood(effective, x)), len(effective)
-    )
+    found = most_likely(remembered(lambda x: log_likelihood(effective, x)), len(effective))
+    factors = zip(effective, found.logs.tolist(), found.deviations.tolist(), strict=True)
+    return [NoiseFactor(*each) for each in factors]
 
 
 def rounded(value: Value) -> Value:
@@ -234,12 +250,3 @@ def rounded(value: Value) -> Value:
 
 def _rounded(value: float) -> float:
     return float(f'{value:.{DIGITS}g}')
-
-
-def certainty(log_factor: float, deviation: float) -> str:
-    """Return a factor and its interval of 95 % as text."""
-    factor = math.exp(log_factor)
-    if not math.isfinite(deviation):
-        return f'× {factor:.2g}, but the recording says little of it'
-    low, high = (math.exp(log_factor + sign * 2.0 * deviation) for sign in (-1, 1))
-    return f'× {factor:.2g} ({low:.2g} to {high:.2g})'
