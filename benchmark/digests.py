@@ -16,6 +16,7 @@ import logging
 from pathlib import Path
 import sys
 import time
+from typing import Any
 
 import numpy as np
 import outliers
@@ -57,7 +58,7 @@ def main() -> None:
         sys.stdout.flush()
         if args.save:
             args.save.mkdir(parents=True, exist_ok=True)
-            flat = {kind: flattened(arrays) for kind, arrays in estimates.items()}
+            flat: dict[str, Any] = {kind: flattened(arrays) for kind, arrays in estimates.items()}
             np.savez(args.save / file_name(name), **flat)
     sys.stdout.write(f'{"":32}  {total_s:6.2f} s  in all\n')
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict
 
 from cost_tables import Table, Tables
 from estimators import EKF, ISAM2, ISAM2_DEFAULT
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+import numpy as np
 import worlds
 
 from slam_observer_ros.evaluation.drawing import BLACK, GREEN, PURPLE, RED, save, STYLE
@@ -38,7 +39,7 @@ BARS = (
 )
 """What is wanted: a text, the table, the row and the column of the figure, and its bar."""
 
-DRAWN = {
+DRAWN: dict[str, Any] = {
     'constant': {'color': BLACK, 'marker': 's'},
     'riccati': {'color': GREEN, 'marker': '^'},
     EKF: {'color': RED, 'marker': 'o'},
@@ -111,7 +112,7 @@ def draw(tables: Tables) -> None:
 def _draw_costs(axes: Axes, table: Table, label: str) -> None:
     counts = [int(column.rpartition(' ')[2]) for column in table['columns']]
     for name, row in table['rows'].items():
-        axes.plot(counts, row, label=name, **DRAWN[name])
+        axes.plot(counts, np.array(row, dtype=np.float64), label=name, **DRAWN[name])
     axes.set_xscale('log')
     axes.set_yscale('log')
     axes.set_xticks(counts, [str(count) for count in counts])

@@ -146,7 +146,7 @@ missed; the other columns are single worlds. Errors on Starry Night are at the f
 so no error there is held against an aim: an oracle that is given the true landmarks and fits each
 pose to the points of that image alone errs by 0.033 m, as the recorded attitude and the camera
 disagree. Where four points or more are seen `riccati` errs by 0.031 m against the recorded poses,
-and by 0.017 m against the fitted ones (`python benchmark/oracle.py`).
+and by 0.017 m against the fitted ones (`python benchmark/studies/oracle.py`).
 
 ANEES: every 5 s, the mean over the Monte Carlo runs of the squared error of the pose (or the
 landmarks) normalised by its covariance and its degrees of freedom; then the mean and the range

@@ -175,7 +175,7 @@ def entered_by_a_report() -> set[str]:
     return entered
 
 
-def _traced(estimator: Estimator, event: ObservationEvent) -> TracedStep:
+def _traced(estimator: Estimator, event: Event) -> TracedStep:
     entered: list[str] = []
     stack: list[str] = []
     counts = {'functions': 0, 'changes': 0, 'depth': 0}

@@ -55,9 +55,9 @@ def measure_passing() -> Tables:
     for passed in PASSED:
         settings, events = replace(settings_for(passed), two_d_mode=True), course(passed)
         costs_s = [_finished_s(name, settings, events) for name in compared]
+        last_s = costs_s[-1]
         for name, cost_s in zip(compared, costs_s, strict=True):
-            is_known = cost_s is not None and costs_s[-1] is not None
-            rows[name].append(cost_s / costs_s[-1] if is_known else None)
+            rows[name].append(None if cost_s is None or last_s is None else cost_s / last_s)
     return {'passing': Table(columns=[f'{n} landmarks' for n in PASSED], rows=rows)}
 
 

@@ -1,8 +1,9 @@
 """Tags with orientations against their positions alone, where few are in view.
 
-``python benchmark/tags.py`` drives a camera by hand past 20 tags for two laps, with at most one,
-two or five of them in view, and prints errors and consistency, means over ``--runs`` seeds with
-the standard error of each ANEES. All estimators are given the same points and velocities.
+``python benchmark/studies/tags.py`` drives a camera by hand past 20 tags for two laps, with at
+most one, two or five of them in view, and prints errors and consistency, means over ``--runs``
+seeds with the standard error of each ANEES. All estimators are given the same points and
+velocities.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 import logging
 import sys
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 import numpy as np
 from odometry import Event
 from worlds import drive, Loop, simulated_settings, World

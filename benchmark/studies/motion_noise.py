@@ -1,9 +1,9 @@
 """What it costs to state the odometry's noise wrong, and what its factors make up for.
 
-``python benchmark/motion_noise.py`` runs each world with the noise of turning and driving stated
-right, three times too small and three times too large, for each ``motion_noise_factor``. A row has
-the configuration error and over that of ``stated``, stated right; ANEES; the factors of turning
-and driving, of standard deviations; CPU time.
+``python benchmark/studies/motion_noise.py`` runs each world with the noise of turning and driving
+stated right, three times too small and three times too large, for each ``motion_noise_factor``. A
+row has the configuration error and over that of ``stated``, stated right; ANEES; the factors of
+turning and driving, of standard deviations; CPU time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from dataclasses import replace
 import logging
 import sys
 import time
+from typing import Any
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 import numpy as np
 from threadpoolctl import threadpool_limits
 import worlds
@@ -65,11 +67,10 @@ def main() -> None:
 
 def with_noise(settings: Settings, factor: float) -> Settings:
     """Return settings that state the noise of the velocity so many times as large."""
-    noise = {name: getattr(settings, name) for name in NOISE}
-    return replace(
-        settings,
-        **{name: tuple(factor * value for value in values) for name, values in noise.items()},
-    )
+    noise: dict[str, Any] = {name: getattr(settings, name) for name in NOISE}
+    for name, values in noise.items():
+        noise[name] = tuple(factor * value for value in values)
+    return replace(settings, **noise)
 
 
 def run(world: World, settings: Settings) -> tuple[ConfigurationError, float, str]:

@@ -1,7 +1,7 @@
 """Which mistakes of a set-up are named: recordings made wrongly on purpose, and as they are.
 
-``python benchmark/mistakes.py`` makes each mistake in the runs of MRCLAM 6, Starry Night and
-simulated drives, and prints in how many of them it is named; then what is named in the runs as
+``python benchmark/studies/mistakes.py`` makes each mistake in the runs of MRCLAM 6, Starry Night
+and simulated drives, and prints in how many of them it is named; then what is named in the runs as
 they are, with outliers, and with noise that is stated wrongly. ``--map`` gives the surveyed map.
 """
 
@@ -16,7 +16,9 @@ import logging
 import math
 import sys
 import time
+from typing import Any
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 import numpy as np
 import outliers
 import slips
@@ -102,7 +104,7 @@ def judged(name: str, with_map: bool) -> dict[str, list[str]]:
     known = surveyed(world) if with_map else None
     found: dict[str, list[str]] = {}
     for what, kinds in WRONG.items():
-        wrong = world.events
+        wrong: list[Event] = list(world.events)
         for kind in kinds:
             wrong = list(MADE[kind].apply(wrong))
         found[what] = [each.kind for each in mistakes(world.settings, wrong, known)]
@@ -114,21 +116,11 @@ def judged(name: str, with_map: bool) -> dict[str, list[str]]:
 def alarms(world: World) -> dict[str, tuple[Settings, Sequence[Event]]]:
     """Return what is right, but not as stated."""
     settings = world.settings
-    noise = {name: getattr(settings, name) for name in NOISE}
     return {
         'as it is': (settings, world.events),
         '10 % outliers': (settings, outliers.with_outliers(world, seed=0).events),
         **{
-            f'noise × {factor:.2g}': (
-                replace(
-                    settings,
-                    **{
-                        name: tuple(factor * each for each in value)
-                        for name, value in noise.items()
-                    },
-                ),
-                world.events,
-            )
+            f'noise × {factor:.2g}': (with_noise(settings, factor), world.events)
             for factor in (3.0, 1.0 / 3.0)
         },
         'slips': (settings, slips.with_slips(world, seed=0).events),
@@ -138,6 +130,14 @@ def alarms(world: World) -> dict[str, tuple[Settings, Sequence[Event]]]:
 
 
 NOISE = ('angular_velocity_noise', 'linear_velocity_noise')
+
+
+def with_noise(settings: Settings, factor: float) -> Settings:
+    """Return settings that state the noise of the velocity so many times as large."""
+    noise: dict[str, Any] = {name: getattr(settings, name) for name in NOISE}
+    for name, values in noise.items():
+        noise[name] = tuple(factor * value for value in values)
+    return replace(settings, **noise)
 
 
 def some(events: Sequence[Event], every: int) -> Iterator[Event]:

@@ -1,8 +1,8 @@
 """What it costs to map without ids: configuration error, consistency and CPU time over those with.
 
-``python benchmark/unlabelled.py`` prints a row a run, and the means over runs of one kind: of
-landmarks with ids, without, and without but with 5 % false points. ``--random N`` draws a hall a
-seed instead (:mod:`halls`), and prints how the ratios are distributed: work on ``--half work``
+``python benchmark/studies/unlabelled.py`` prints a row a run, and the means over runs of one kind:
+of landmarks with ids, without, and without but with 5 % false points. ``--random N`` draws a hall
+a seed instead (:mod:`halls`), and prints how the ratios are distributed: work on ``--half work``
 of the seeds, and report the other half.
 """
 
@@ -18,6 +18,7 @@ import os
 import sys
 import time
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 import halls
 import numpy as np
 import outliers

@@ -65,7 +65,7 @@ def write(path: Path, count: int) -> None:
         data = bytes(store.serialize_cdr(twist, twist.__msgtype__))
         for stamp_ns in range(START_NS, START_NS + count * PERIOD_NS, PERIOD_NS):
             writer.add_message(channels['/twist'], stamp_ns, data, stamp_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def replay(path: Path) -> tuple[float, float]:

@@ -1,8 +1,8 @@
 """One look at reflectors without ids, among thousands: how often it says where the robot is.
 
-``python benchmark/one_look.py`` prints, for halls of random reflectors and halls that look the
-same from several places, in how many of 200 looks the place was found, and wrong, and the CPU time
-of one core. ``--needed`` prints how many points it takes (docs/surveyed_reflectors.md).
+``python benchmark/studies/one_look.py`` prints, for halls of random reflectors and halls that look
+the same from several places, in how many of 200 looks the place was found, and wrong, and the CPU
+time of one core. ``--needed`` prints how many points it takes (docs/surveyed_reflectors.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A robot that is switched on anywhere, or carried, in a map that it knows.
 
-``python benchmark/found_anywhere.py lost`` starts MRCLAM 6 at random times without ids, in the
-surveyed map, and says when it is localised, and whether that is right. ``carried`` lets the
+``python benchmark/studies/found_anywhere.py lost`` starts MRCLAM 6 at random times without ids, in
+the surveyed map, and says when it is localised, and whether that is right. ``carried`` lets the
 recording jump after a minute; ``tag`` starts in view of one tag at a time, with orientation.
 """
 
@@ -14,6 +14,7 @@ import logging
 import sys
 import time
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 import numpy as np
 from odometry import Event
 import outliers
@@ -75,6 +76,13 @@ class Robot:
         """Return where it truly is (4, 4); None where that is not known."""
         poses, are_known = interpolate(self.world.truth, np.array([stamp_ns]))
         return poses[0] if are_known[0] else None
+
+    def start(self, estimator: Estimator, stamp_ns: int) -> None:
+        """Give an estimator the true pose at a time when that is known."""
+        pose = self.pose(stamp_ns)
+        if pose is None:
+            raise ValueError('the true pose is not known then')
+        estimator.set_pose(pose, np.diag([1e-4] * 3 + [1e-2] * 3))
 
     def is_right(self, estimator: Estimator, stamp_ns: int) -> bool:
         """Return whether the estimated pose is right, as it is said of an unknown one."""
@@ -161,11 +169,11 @@ def _places(robot: Robot, rng: np.random.Generator) -> tuple[float, float]:
     while True:
         before, after = rng.uniform(0.0, robot.duration_s - BEFORE_CARRY_S - AFTER_CARRY_S, 2)
         stamps_s = robot.start_s + np.array([before, before + BEFORE_CARRY_S, after])
-        poses = [robot.pose(round(stamp_s * 1e9)) for stamp_s in stamps_s]
-        if all(pose is not None for pose in poses):
-            _, at, to = poses
-            if np.linalg.norm(at[:3, 3] - to[:3, 3]) > CARRIED_M:
-                return float(before), float(after)
+        start, at, to = (robot.pose(round(stamp_s * 1e9)) for stamp_s in stamps_s)
+        if start is None or at is None or to is None:
+            continue
+        if np.linalg.norm(at[:3, 3] - to[:3, 3]) > CARRIED_M:
+            return float(before), float(after)
 
 
 def _carry(
@@ -179,7 +187,7 @@ def _carry(
     second = robot.world.part(after, after + AFTER_CARRY_S).events
     shift_ns = first[-1].stamp_ns + 50_000_000 - second[0].stamp_ns
     estimator = robot.estimator(mode)
-    estimator.set_pose(robot.pose(first[0].stamp_ns), np.diag([1e-4] * 3 + [1e-2] * 3))
+    robot.start(estimator, first[0].stamp_ns)
     for event in first:
         estimator.add(event)
     seen_s = noticed = recovered = wrong_since = None
@@ -212,7 +220,7 @@ def alarms(args: argparse.Namespace) -> Iterator[str]:
             for event in robot.world.events
             if robot.pose(event.stamp_ns) is not None
         )
-        estimator.set_pose(robot.pose(begin_ns), np.diag([1e-4] * 3 + [1e-2] * 3))
+        robot.start(estimator, begin_ns)
         for event in robot.world.events:
             if event.stamp_ns >= begin_ns:
                 estimator.add(event)

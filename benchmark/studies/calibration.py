@@ -1,9 +1,10 @@
 """What systematic errors of a sensor cost: in simulated loops, and in MRCLAM 6.
 
-``python benchmark/calibration.py`` drives small loops with each error alone and with all, whose
-figures the settings state; then what ``slam-observer calibrate`` finds in a surveyed map, with all
-of them, in twice as many drives; then robots of MRCLAM 6 with the shipped settings, beside iSAM2
-on the same points, corrected as the settings state. Ratios are to the runs without an error.
+``python benchmark/studies/calibration.py`` drives small loops with each error alone and with all,
+whose figures the settings state; then what ``slam-observer calibrate`` finds in a surveyed map,
+with all of them, in twice as many drives; then robots of MRCLAM 6 with the shipped settings,
+beside iSAM2 on the same points, corrected as the settings state. Ratios are to the runs without an
+error.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 import numpy as np
 from threadpoolctl import threadpool_limits
 import worlds

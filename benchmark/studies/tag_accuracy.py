@@ -1,7 +1,7 @@
 """How well a wheeled robot is localised among AprilTags, by their number and size, simulated.
 
-``python benchmark/tag_accuracy.py`` prints the table of docs/nav2.md. The hall is that of ``make
-robot``; a smaller number of tags is every second or every fourth of them.
+``python benchmark/studies/tag_accuracy.py`` prints the table of docs/nav2.md. The hall is that of
+``make robot``; a smaller number of tags is every second or every fourth of them.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / 'demo'))
+sys.path.append(str(Path(__file__).resolve().parents[2] / 'demo'))
 hall = import_module('hall')
 
-PARAMS_FILE = Path(__file__).resolve().parents[1] / 'config' / 'tags_on_tf.yaml'
+PARAMS_FILE = Path(__file__).resolve().parents[2] / 'config' / 'tags_on_tf.yaml'
 EVERY = (4, 2, 1)
 SIZES_M = (0.08, 0.16, 0.32)
 RATE_HZ, PER_IMAGE = 50, 5
@@ -83,8 +83,9 @@ def run(every: int, size_m: float, seed: int, duration_s: float) -> np.ndarray:
         if seen := hall.sightings(truth, tags, off, size_m):
             points = se3.transform(hall.CAMERA, np.array([pose[:3, 3] for pose in seen.values()]))
             estimator.add(ObservationEvent(stamp_ns, np.array(list(seen)), points))
-        if estimator.is_localised and step > SETTLED_S * RATE_HZ:
-            errors.append(error_of(hall.true_pose(estimator.stamp_ns * 1e-9), estimator.pose))
+        at_ns = estimator.stamp_ns
+        if estimator.is_localised and at_ns is not None and step > SETTLED_S * RATE_HZ:
+            errors.append(error_of(hall.true_pose(at_ns * 1e-9), estimator.pose))
     return np.array(errors).reshape(-1, 3)
 
 

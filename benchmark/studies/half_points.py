@@ -1,8 +1,8 @@
 """Ranges alone: Plaza 1 and 2, in a survey of the anchors and without.
 
-``python benchmark/half_points.py`` prints errors against the truth by the shipped ``uwb.yaml``.
-By how much the ranges, which are 7 % long, are so is not known. The data is not shipped: it is
-read from ``plaza`` in the folder that SLAM_OBSERVER_DATA names.
+``python benchmark/studies/half_points.py`` prints errors against the truth by the shipped
+``uwb.yaml``. By how much the ranges, which are 7 % long, are so is not known. The data is not
+shipped: it is read from ``plaza`` in the folder that SLAM_OBSERVER_DATA names.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ def main() -> None:
 def row(run: int, is_surveyed: bool) -> str:
     """Drive once; return position error after alignment, ANEES of the position, and CPU time."""
     events, truth, anchors = read(run)
-    start, poses, nees = truth.poses[0], [], []
+    start = truth.poses[0]
+    poses: list[tuple[int, FloatArray]] = []
+    nees: list[float] = []
 
     def note(update: Update) -> None:
         covariance = estimator.pose_covariance
@@ -51,7 +53,7 @@ def row(run: int, is_surveyed: bool) -> str:
         if covariance is not None and covariance[3, 3] > 0.0:
             at = np.searchsorted(truth.stamps_ns, update.stamp_ns).clip(max=len(truth) - 1)
             off = (update.pose[:3, 3] - truth.poses[at, :3, 3])[:2]
-            nees.append(off @ np.linalg.solve(covariance[3:5, 3:5], off) / 2.0)
+            nees.append(float(off @ np.linalg.solve(covariance[3:5, 3:5], off)) / 2.0)
 
     estimator = Estimator(settings(), initial_pose=start, on_update=note)
     if is_surveyed:

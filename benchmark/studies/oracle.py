@@ -1,4 +1,4 @@
-"""How exact the truth of Starry Night is: ``python benchmark/oracle.py``.
+"""How exact the truth of Starry Night is: ``python benchmark/studies/oracle.py``.
 
 An oracle is given the true landmarks, and its pose in each image is the one that fits the points
 seen in it best. What it is off by from the recorded poses no estimator can do much better than:
@@ -11,6 +11,7 @@ import argparse
 from dataclasses import replace
 import sys
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 from estimators import ONLINE, Run, run_online, Snapshot
 import numpy as np
 from scores import score

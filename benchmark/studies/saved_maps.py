@@ -1,7 +1,7 @@
 """What correlations in a saved map are worth to the next run, simulated, and what they take.
 
-``python benchmark/saved_maps.py`` prints the tables of docs/localise_in_a_map.md. A robot maps
-most of a loop and saves the map; later it starts somewhere, finds itself in it, and goes on.
+``python benchmark/studies/saved_maps.py`` prints the tables of docs/localise_in_a_map.md. A robot
+maps most of a loop and saves the map; later it starts somewhere, finds itself in it, and goes on.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 
+import _above  # noqa: F401 (finds the modules of the folder above)
 import numpy as np
 from odometry import Event
 import tags
@@ -135,7 +136,7 @@ def run(job: Job) -> FloatArray:
         if is_due and second.is_localised:
             figures.append(compared(second, world, frame, event.stamp_ns))
             due_s += CHECKPOINT_S
-    return np.mean(figures, axis=0)
+    return np.asarray(np.mean(figures, axis=0))
 
 
 def between(events: Sequence[Event], from_s: float, to_s: float) -> list[Event]:
@@ -182,7 +183,10 @@ def compared(
     pose = frame @ world.truth.poses[np.searchsorted(world.truth.stamps_ns, stamp_ns)]
     truth = world.landmarks.world_points
     error = pose_errors(estimator.pose, pose)
-    nees, freedom = normalised_squared_errors(error, estimator.pose_covariance)
+    covariance = estimator.pose_covariance
+    if covariance is None:
+        raise ValueError('it takes gains that know their errors')
+    nees, freedom = normalised_squared_errors(error, covariance)
     configuration = ConfigurationError()
     configuration.add(
         stamp_ns,
