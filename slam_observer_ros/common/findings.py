@@ -458,6 +458,13 @@ KINDS = {
         'not used: an observation has several points of the ids {ids}',
         'give each landmark an id of its own',
     ),
+    'id_at_two_places': Kind(
+        Level.WARNING,
+        'landmark {id} is seen now at ({x:.1f}, {y:.1f}, {z:.1f}) m, now at '
+        '({other_x:.1f}, {other_y:.1f}, {other_z:.1f}) m: its id is there twice, or it is moved '
+        'to and fro',
+        'look for its id at both places, and give one of the two another id',
+    ),
     'reserved_id': Kind(
         Level.WARNING,
         'not used: points with the ids {ids}; those from {first} to {last} number landmarks '

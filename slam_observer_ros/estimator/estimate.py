@@ -92,6 +92,11 @@ class Estimate:
         return self._localiser.problem(self._state.observer.A)
 
     @property
+    def ids_at_two_places(self) -> list[Finding]:
+        """Landmarks whose id seems to be there twice, by how they were seen so far."""
+        return list(self._warnings.two_places.findings.values())
+
+    @property
     def possible_poses(self) -> FloatArray:
         """(q, 4, 4) where in a loaded map the robot may be, by points without ids, likely first.
 

@@ -356,11 +356,15 @@ class Estimator(Estimate):
 
         Return whether that may have moved the robot.
         """
+        if self._localiser.is_localised:
+            self._warnings.two_places.note(self._state, event, update)
         if self._localiser.maps:
             was_localised = self._localiser.is_localised
             self._placement.localise(event, update)
             if self._localiser.is_localised != was_localised:
                 self._half_points.clear()
+                # It is in the same map again later, unless there are several.
+                self._warnings.two_places.doubt(is_all=len(self._localiser.maps) > 1)
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
             is_alone = len(self._hypotheses) == 1
@@ -395,6 +399,7 @@ class Estimator(Estimate):
         """Forget all that has a stamp but the map."""
         settings = self.settings
         self._half_points.clear()
+        self._warnings.two_places.doubt(is_all=True)
         self._queue = EventQueue(
             window_ns=to_ns(settings.reorder_window),
             max_jump_ns=to_ns(settings.max_stamp_jump),

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 import logging
+import math
 
-from slam_observer_ros.common.findings import found
+import numpy as np
+
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
-from slam_observer_ros.common.types import IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import changed_names
+from slam_observer_ros.state.matching import is_contradiction, SAME_POSITION
+from slam_observer_ros.state.state import State
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +36,12 @@ MANY_MOVED = 5
 MOVED_LATELY_NS = 60 * NANOSECONDS_PER_SECOND
 """How long ago that is at most, nanoseconds."""
 
+MOST_PLACES = 8
+"""Places that are remembered of one id."""
+
+RETURNED = 0.25
+"""Share of the way to another place by which a landmark that is back may be off, as maps drift."""
+
 UNEXPECTED_POSES = ('slip', 'unexpected_place', 'doubled_landmark')
 """Counts that grow when something is wrong with the robot's pose."""
 
@@ -38,6 +53,7 @@ class EventWarnings:
         self._counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
         self._moved_ns: dict[int, int] = {}
+        self.two_places = TwoPlaces()
 
     def warn(self, kind: str, counted_as: str = '', **figures: object) -> None:
         """Count one more of a kind of finding; it is logged if there are 1, 10, 100 and so on."""
@@ -81,6 +97,7 @@ class EventWarnings:
             if count > self._reported.get(name, 0):
                 self.warn(name)
                 self._reported[name] = count
+                self.two_places.doubt(is_all=True)
 
     def unused_settings(self, settings: Settings, gains: Gains) -> None:
         """Name settings that have been changed and have no effect."""
@@ -99,6 +116,126 @@ class EventWarnings:
         self._counts[kind] += 1
         if self._counts[kind] == 1:
             logger.warning('%s', found(kind, **figures).text())
+
+
+@dataclass(slots=True)
+class _Sighted:
+    """Where a landmark was seen that was rejected, in the world, metres."""
+
+    places: list[FloatArray]  # (3,) one after the other, the first where it was known to be
+    # By sensor: mean (3,) of the latest points in a row at one place, and how many there were.
+    runs: dict[str, tuple[FloatArray, int]] = field(default_factory=dict)
+    pending: FloatArray | None = None  # (3,) the next place, if the pose is right
+    against: set[int] = field(default_factory=set)  # landmarks that say that it is not
+
+
+class TwoPlaces:
+    """Finds landmarks whose id is there twice: seen at one place, at another, and at the first.
+
+    It counts as a place where a landmark is seen ``max_rejections`` times in a row, as it does to
+    take one for moved. If it was rejected there, the pose may have been wrong instead: the other
+    landmarks that are seen then, or next, decide that.
+    """
+
+    def __init__(self) -> None:
+        self._sighted: dict[int, _Sighted] = {}
+        self.findings: dict[int, Finding] = {}  # by id
+
+    def doubt(self, *, is_all: bool) -> None:
+        """Forget where landmarks seem to be as the pose was wrong; or all places, if it may be."""
+        kept = {} if is_all else self._sighted
+        self._sighted = {i: _Sighted(each.places) for i, each in kept.items()}
+
+    def note(self, state: State, event: ObservationEvent, update: Update) -> None:
+        """Take what an observation has shown."""
+        if not self._sighted and not np.count_nonzero(update.rejected):
+            return
+        rejected = dict(zip(update.ids.tolist(), update.rejected.tolist(), strict=True))
+        self._confirm({i: is_off for i, is_off in rejected.items() if i not in self._sighted})
+        at = {i: k for k, i in enumerate(event.ids.tolist()) if i in rejected}
+        points = se3.transform(update.pose, event.points)
+        if len(rejected) > 1 and is_contradiction(update.rejected):
+            return
+        self._begin(state, update, {i: points[k] for i, k in at.items()})
+        variances = np.trace(state.observation_noise.covariances(event), axis1=1, axis2=2)
+        for i in self._sighted.keys() & at.keys():
+            tolerance_m = SAME_POSITION * math.sqrt(variances[at[i]])
+            often = state.settings.max_rejections
+            seen = points[at[i]], event.sensor_frame
+            self._follow(i, *seen, rejected[i], tolerance_m, often)
+
+    def _confirm(self, are_off: Mapping[int, bool]) -> None:
+        """Decide by other landmarks, that are rejected or not, whether the pose was right."""
+        votes = len(are_off) - 2 * sum(are_off.values())
+        for i, sighted in list(self._sighted.items()):
+            if sighted.pending is None or not votes:
+                continue
+            if votes > 0:
+                self._add(i, sighted.pending)
+                continue
+            sighted.against.update(other for other, is_off in are_off.items() if is_off)
+            if len(sighted.against) > 1:  # a single one may be there twice, too
+                del self._sighted[i]
+
+    def _begin(self, state: State, update: Update, points: Mapping[int, FloatArray]) -> None:
+        """Follow landmarks that are rejected for the first time, if they were known well."""
+        landmarks, rows = state.landmarks, state.landmarks.rows_of(update.ids)
+        for k in np.flatnonzero(update.rejected & (rows >= 0)).tolist():
+            i, row = int(update.ids[k]), rows[k]
+            is_known = landmarks.counts[row] >= state.settings.confirmations
+            is_known |= landmarks.born_ns[row] < 0  # in a map that was loaded
+            if is_known and i in points and i not in self._sighted:
+                self._sighted[i] = _Sighted([points[i] - update.residuals[k]])
+
+    def _follow(
+        self,
+        landmark_id: int,
+        point: FloatArray,
+        sensor: str,
+        is_rejected: bool,
+        tolerance_m: float,
+        often: int,
+    ) -> None:
+        """Take one more point (3,) of a landmark, world, metres."""
+        sighted = self._sighted[landmark_id]
+        places = sighted.places
+        if not is_rejected and len(places) == 1 and sighted.pending is None:
+            sighted.runs.pop(sensor, None)
+            if not sighted.runs:  # but an outlier
+                del self._sighted[landmark_id]
+            return
+        pending = sighted.pending
+        if pending is not None and not is_rejected:
+            is_there = np.linalg.norm(point - pending) <= tolerance_m
+            sighted.pending = pending if is_there else None  # it was the pose that was wrong
+        mean, count = sighted.runs.get(sensor, (point, 0))
+        if np.linalg.norm(point - mean) > tolerance_m:
+            mean, count = point, 0
+        count = min(count + 1, often)
+        mean = mean + (point - mean) / count
+        sighted.runs[sensor] = mean, count
+        if count < often:
+            return
+        off_m = np.linalg.norm(mean - places[-1])
+        if off_m > 2.0 * tolerance_m:
+            sighted.pending = mean
+            if not is_rejected:
+                self._add(landmark_id, mean)
+
+    def _add(self, landmark_id: int, place: FloatArray) -> None:
+        """Note that a landmark is at a place; it is found if it has been there before."""
+        sighted = self._sighted[landmark_id]
+        sighted.pending, sighted.against, last = None, set(), sighted.places[-1]
+        near_m = RETURNED * float(np.linalg.norm(place - last))
+        before = sighted.places[:-1]
+        has_returned = any(np.linalg.norm(place - each) <= near_m for each in before)
+        sighted.places = [*sighted.places, place][-MOST_PLACES:]
+        if has_returned and landmark_id not in self.findings:
+            (x, y, z), (other_x, other_y, other_z) = place.tolist(), last.tolist()
+            figures = {'other_x': other_x, 'other_y': other_y, 'other_z': other_z}
+            finding = found('id_at_two_places', id=landmark_id, x=x, y=y, z=z, **figures)
+            self.findings[landmark_id] = finding
+            logger.warning('%s', finding)
 
 
 def listed(ids: Iterable[int]) -> str:

@@ -167,7 +167,7 @@ class DiagnosticsPublisher:
             reasons = f'mostly {reason}' if others else reason
             findings.append(found('dropped_messages', count=count, reasons=reasons))
         findings += self._of_messages()
-        findings += self._of_empty_messages()
+        findings += self._of_empty_messages() + self._estimator.ids_at_two_places
         findings += of_left_out(new, Level.WARNING)
         self._recent_counts.append(new)
         recent = sum(self._recent_counts, Counter())
