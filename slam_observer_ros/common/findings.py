@@ -338,6 +338,18 @@ KINDS = {
     'ambiguous_place': Kind(
         Level.WARNING, 'what was seen fits {number} in {where}, {places}', GIVE_THE_POSE
     ),
+    'drive_a_curve': Kind(
+        Level.WARNING,
+        'the ranges or directions seen so far fit {number} places in {where}, {places}',
+        'drive a curve, or give the pose (on initialpose, or by set_initial_pose)',
+    ),
+    'anchors_in_a_line': Kind(
+        Level.WARNING,
+        'the landmarks seen so far ({ids}) stand in a line, and their ranges fit on both sides '
+        'of it',
+        'move one of them off the line, drive on to others, or give the pose (on initialpose, or '
+        'by set_initial_pose)',
+    ),
     'lost_pose': Kind(
         Level.WARNING,
         'the pose in the map {path} was lost after {seconds:.1f} s, and not found again: the '

@@ -146,6 +146,8 @@ class Estimator(Estimate):
         """
         maps = usable_maps(landmark_map)
         self._half_points.heights_m = heights_of(maps)
+        self._half_points.mapped_ids = np.concatenate([known.ids for known in maps])
+        self._half_points.clear()
         if self.settings.localization_mode == 'off':
             largest = max(len(known.ids) for known in maps)
             self._warnings.loaded_map(largest, self.settings.max_landmarks)
@@ -334,7 +336,8 @@ class Estimator(Estimate):
         )
         event = self._timeline.synchronise(usable)
         if event.kinds is not None:
-            event = self._half_points.completed(event, self._state)
+            is_lost = not self._localiser.is_localised
+            event = self._half_points.completed(event, self._state, is_lost=is_lost)
         if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
             self._placement.doubt(*self.uncertain_pose)
         update = self._hypotheses.observe(event)
@@ -360,7 +363,7 @@ class Estimator(Estimate):
             self._warnings.two_places.note(self._state, event, update)
         if self._localiser.maps:
             was_localised = self._localiser.is_localised
-            self._placement.localise(event, update)
+            self._placement.localise(event, update, self._half_points.window)
             if self._localiser.is_localised != was_localised:
                 self._half_points.clear()
                 # It is in the same map again later, unless there are several.

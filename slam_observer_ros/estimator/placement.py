@@ -20,6 +20,7 @@ from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.state.state import State
+from slam_observer_ros.state.waiting_room import Window
 
 logger = logging.getLogger(__name__)
 
@@ -108,8 +109,11 @@ class Placement:
             self.start(None)
             self.localiser.search_near(pose, covariance)
 
-    def localise(self, event: ObservationEvent, update: Update) -> None:
-        """Look for the pose in a loaded map if it is not known, or not any more."""
+    def localise(self, event: ObservationEvent, update: Update, window: Window) -> None:
+        """Look for the pose in a loaded map if it is not known, or not any more.
+
+        The ``window`` has the views of ranges or bearings alone since then.
+        """
         localiser, hypotheses = self.localiser, self.hypotheses
         missed = hypotheses.missed
         reason = localiser.reason_to_reset(hypotheses.best, event, update, missed)
@@ -121,6 +125,8 @@ class Placement:
         elif (by_tag := localiser.pose_by_tag(hypotheses.best)) is not None:
             self.start(by_tag.pose, by_tag.covariance, by_tag.known)
             localiser.try_tag(by_tag.tag_id)
+        elif (fix := localiser.pose_by_half_points(hypotheses.best, window)) is not None:
+            self.start(*fix)
 
     def start(
         self,

@@ -23,9 +23,11 @@ from slam_observer_ros.known_map.map_alignment import (
 )
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
 from slam_observer_ros.state.state import State
+from slam_observer_ros.state.waiting_room import Window
 
 if TYPE_CHECKING:
     from slam_observer_ros.known_map.finder import Finder
+    from slam_observer_ros.known_map.half_finder import HalfFinder
     from slam_observer_ros.known_map.places import Place
 
 logger = logging.getLogger(__name__)
@@ -78,6 +80,7 @@ class Localiser:
         self._trial: PoseTrial | None = None
         self._comparisons = Comparisons()
         self._finder: Finder | None = None
+        self._half_finder: HalfFinder | None = None
         self._rough: tuple[FloatArray, FloatArray] | None = None
         self._unexplained = Unexplained()
         self._contradiction = Contradiction()
@@ -122,7 +125,7 @@ class Localiser:
         """Take the pose in the map for unknown, and forget what was seen."""
         self.is_localised = False
         self.loaded = self.maps[0] if len(self.maps) == 1 else None
-        self._trial = self._finder = self._rough = self._tag = None
+        self._trial = self._finder = self._half_finder = self._rough = self._tag = None
         self._said_problem = False
         self._comparisons, self._unexplained = Comparisons(), Unexplained()
         self._contradiction = Contradiction()
@@ -197,6 +200,27 @@ class Localiser:
         self._tag = tag_id
         logger.info('Found the pose in the map by tag %d.', tag_id)
 
+    def pose_by_half_points(
+        self, state: State, window: Window
+    ) -> tuple[FloatArray, FloatArray, LandmarkMap] | None:
+        """Return pose (4, 4), covariance (6, 6) and map by the views of ranges or bearings alone.
+
+        None while the pose in the map is known, or they fit no place or several.
+        """
+        if self.is_localised or not window.views:
+            return None
+        from slam_observer_ros.known_map.half_finder import HalfFinder  # which few runs need
+
+        if self._half_finder is None:
+            self._half_finder = HalfFinder(self.maps)
+        fix, finder = self._half_finder.find(state, window), self._half_finder
+        if fix is not None:
+            logger.info('Found the pose in the map by %d half points.', len(window.views))
+        elif (finder.rivals or finder.in_a_line) and not self._said_problem:
+            self._said_problem = True
+            logger.warning('%s', self.problem(state.observer.A))
+        return fix
+
     @property
     def places(self) -> list[Place]:
         """Where in the map the robot's own frame may be, the most likely place first."""
@@ -207,6 +231,14 @@ class Localiser:
         """Return why the pose in the map is not known, by Â (4, 4); None if it is."""
         if self.is_localised:
             return None
+        if (finder := self._half_finder) is not None and finder.in_a_line:
+            ids = ', '.join(str(landmark_id) for landmark_id in finder.in_a_line)
+            return found('anchors_in_a_line', ids=ids)
+        if finder is not None and finder.rivals:
+            fits = ' and '.join(_where(pose) for pose in finder.rivals[:MAX_NAMED])
+            return found(
+                'drive_a_curve', number=len(finder.rivals), where=self._where, places=fits
+            )
         places = [place for place in self.places if place.share > LEAST_SHARE]
         if not places:
             return found('no_place', where=self._where)
@@ -273,10 +305,14 @@ class Localiser:
 
     def _name(self, place: Place, A: FloatArray) -> str:
         """Return where the robot is at a place, by Â (4, 4), in words."""
-        pose = place.transform @ A
-        x, y = pose[:2, 3]
-        there = f'({x:.1f} m, {y:.1f} m, {math.atan2(pose[1, 0], pose[0, 0]):.2f} rad)'
+        there = _where(place.transform @ A)
         return there if len(self.maps) == 1 else f'{there} in {self.maps[place.map_index].name}'
+
+
+def _where(pose: FloatArray) -> str:
+    """Return where a pose (4, 4) is, in words."""
+    x, y = pose[:2, 3]
+    return f'({x:.1f} m, {y:.1f} m, {math.atan2(pose[1, 0], pose[0, 0]):.2f} rad)'
 
 
 def is_lost(state: State) -> bool:

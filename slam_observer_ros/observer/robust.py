@@ -10,6 +10,8 @@ Residuals r are (m, k), metres; ``predicted`` (m k, m k) is their covariance C P
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
@@ -34,6 +36,10 @@ The state's errors are linearised: large ones explain more than their covariance
 
 REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
+
+DETOURS = 0.2
+"""Share of the ranges that came through a wall or by a reflection, where nothing is known of it:
+one in five, as of points without ids that are of no landmark (known_map/places.py)."""
 
 
 def observation_weights(
@@ -109,6 +115,28 @@ def odd_ones(r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: floa
 def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
     """Return the Mahalanobis distance (m,) of each residual."""
     return mahalanobis(r, diagonal_blocks(predicted, r.shape[1]) + noise)
+
+
+def straight_odds(sigmas_m: FloatArray, ranges_m: FloatArray) -> FloatArray:
+    """Return the density of straight ranges where they are right, over that of all detours.
+
+    A range through a wall or by a reflection is too long, never too short. A detour may add as
+    much as the straight way is long, and anything up to that alike: its density is 1/ρ, of a
+    straight one 1/(√(2π) σ). ``DETOURS`` is the share of ranges that have made one.
+    """
+    straight = (1.0 - DETOURS) / (math.sqrt(2.0 * math.pi) * sigmas_m)
+    return np.asarray(straight * np.maximum(ranges_m, sigmas_m) / DETOURS)
+
+
+def straight_share(off: FloatArray, odds: FloatArray) -> FloatArray:
+    """Return the probability that ranges came straight, ``off`` standard deviations too long.
+
+    ``odds`` are the :func:`straight_odds`. Of three standard deviations it is a half or so, of
+    four next to nothing, and one for a range that is too short.
+    """
+    is_long = off > 0.0
+    straight = odds * np.exp(-0.5 * np.square(np.where(is_long, off, 0.0)))
+    return np.where(is_long, straight / (1.0 + straight), 1.0)
 
 
 def huber_weights(

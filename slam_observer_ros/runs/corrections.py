@@ -143,6 +143,7 @@ SYMPTOMS = frozenset(
         'unmapped_points',
         'unknown_pose',
         'no_place',
+        'drive_a_curve',
         'lost_pose',
         'wrong_pose',
         'contradicted_pose',

@@ -28,7 +28,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry.sensor_mounting import directions_of
 from slam_observer_ros.sensor_models.observation_noise import point_covariances
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.waiting_room import sensor_values, WaitingRoom
+from slam_observer_ros.state.waiting_room import sensor_values, WaitingRoom, Window
 
 UNMEASURED_M = 1e3
 """Standard deviation of a completed point where nothing was measured: as large as a message may
@@ -56,12 +56,13 @@ class HalfPoints:
 
     def __init__(self, counts: Outcomes) -> None:
         self._counts = counts
-        self._waiting = WaitingRoom()
+        self._waiting, self.window = WaitingRoom(), Window()
         self.heights_m: Mapping[int, float] = {}  # of the landmarks of a loaded map
+        self.mapped_ids = np.empty(0, dtype=np.int64)  # of the landmarks of loaded maps
 
     def clear(self) -> None:
         """Forget the views that wait: time or frame are others."""
-        self._waiting = WaitingRoom()
+        self._waiting, self.window = WaitingRoom(), Window()
 
     def levelled(self, event: ObservationEvent) -> ObservationEvent:
         """Return ranges in space as they are in the plane, where landmarks' heights are known."""
@@ -81,8 +82,13 @@ class HalfPoints:
         points = event.points + (level - 1.0)[:, None] * lines
         return replace(event, points=points, covariances=covariances)
 
-    def completed(self, event: ObservationEvent, state: State) -> ObservationEvent:
-        """Return an observation whose points are whole; those of which nothing is known wait."""
+    def completed(
+        self, event: ObservationEvent, state: State, *, is_lost: bool
+    ) -> ObservationEvent:
+        """Return an observation whose points are whole; those of which nothing is known wait.
+
+        Of a robot that ``is_lost`` in a map those of its landmarks go to the :attr:`window`.
+        """
         if event.kinds is None or not (event.kinds != POINT).any():
             return event
         # Zero residuals where nothing was measured would say that the motion is exact.
@@ -91,8 +97,13 @@ class HalfPoints:
         rows = state.landmarks.rows_of(event.ids)
         lines, covariances = _completed(state, event, rows)
         entered = np.zeros(len(rows), dtype=np.bool_)
+        is_sought = is_lost & np.isin(event.ids, self.mapped_ids)
+        if is_sought.any():
+            _, measured = _completed(state, event, np.full(len(rows), -1))
+            for row in np.flatnonzero(is_sought).tolist():
+                self.window.add(state, event, row, measured[row])
         if state.is_mapping:
-            is_new = (rows < 0) & (event.kinds != POINT)
+            is_new = (rows < 0) & (event.kinds != POINT) & ~is_sought
             for row in np.flatnonzero(is_new).tolist():
                 found = self._waiting.add(state, event, row, covariances[row])
                 if found is not None:
@@ -154,12 +165,12 @@ def _completed(
     known = rows >= 0
     if known.any():
         expected[known] = expected_lines(state, event.select(known), rows[known])
-    kinds = _of_axes(event.kinds, state)
+    kinds = of_axes(event.kinds, state)
     lines = _combined(shown, expected, MEASURED[kinds])
     return lines, _covariances(state, event, lines, kinds)
 
 
-def _of_axes(kinds: IntArray | None, state: State) -> IntArray:
+def of_axes(kinds: IntArray | None, state: State) -> IntArray:
     """Return kinds as they are in the plane, too, where an azimuth is a whole direction."""
     whole = {AZIMUTH: BEARING, AZIMUTH_RANGE: POINT} if state.axes.point == 2 else {}
     all_kinds = np.asarray(kinds)

@@ -33,6 +33,9 @@ TRY_AGAIN, MOST_BETWEEN = 1.3, 40
 LEAST_MOVE_M, LEAST_TURN_RAD = 0.05, 0.05
 """By how much a view differs from the last one: from one place all have the same error."""
 
+MOST_TURN_RAD = 0.3
+"""Standard deviation of a turn up to which the way since a view is known well: it is linear."""
+
 SURE = 0.1
 """Largest standard deviation of a point, as a share of its distance, that is linear enough."""
 
@@ -54,12 +57,113 @@ DEPTHS_M = (1.0, 4.0, 15.0)
 class View:
     """One half measurement, and from where: in the frame of P°."""
 
+    landmark_id: int
+    kind: int
+    sensor_frame: str
     pose: FloatArray  # (4, 4) of the body
     origin: FloatArray  # (3,) of the sensor
     line: FloatArray  # (3,) of sight, as measured
     variances: FloatArray  # (3,) along it, and across it in rad²
     walk: FloatArray  # (6, 6) covariance of the way until then
-    is_range: bool
+
+    @property
+    def is_range(self) -> bool:
+        """Whether only the distance was measured."""
+        return self.kind == RANGE
+
+    def is_near(self, other: View, times: float = 1.0) -> bool:
+        """Return whether the sensor has moved less than it takes between this view and another."""
+        turn = np.linalg.norm(se3.log(se3.inverse(self.pose) @ other.pose)[:3])
+        moved_m = float(np.linalg.norm(self.origin - other.origin))
+        return moved_m < times * LEAST_MOVE_M and float(turn) < times * LEAST_TURN_RAD
+
+
+class Way:
+    """The covariance of the way since the first view, in the frame of P°."""
+
+    def __init__(self) -> None:
+        self.covariance = np.zeros((6, 6))
+        self._last_ns: int | None = None
+        self._last_pose = np.eye(4)
+
+    def go_on(self, state: State, stamp_ns: int) -> None:
+        """Add the noise of the way since the last view."""
+        A, settings = state.observer.A, state.settings
+        if self._last_ns is not None and stamp_ns > self._last_ns:
+            dt_s = to_s(stamp_ns - self._last_ns)
+            move = np.abs(se3.log(se3.inverse(self._last_pose) @ A))
+            density = np.array([*settings.angular_velocity_noise, *settings.linear_velocity_noise])
+            share = np.array([*settings.angular_scale_noise, *settings.linear_scale_noise])
+            variances = density**2 * dt_s + (share * move) ** 2
+            Ad = se3.adjoint(A)
+            self.covariance = self.covariance + (Ad * variances) @ Ad.T
+        if self._last_ns is None or stamp_ns > self._last_ns:
+            self._last_ns, self._last_pose = stamp_ns, A.copy()
+
+    def view(
+        self, state: State, event: ObservationEvent, row: int, covariance: FloatArray
+    ) -> View:
+        """Return the half point at ``row``, with the covariance (3, 3) of its line of sight."""
+        A = state.observer.A.copy()
+        R, shift, scale = sensor_values(state, event)
+        origin = event.points[row] - event.lines_of_sight[row] + shift
+        line = scale * (R @ event.lines_of_sight[row])
+        kind = int(np.asarray(event.kinds)[row])
+        basis = directions_of(line[None])[0]
+        variances = np.einsum('ij,jk,ik->i', basis, covariance, basis)
+        if kind != RANGE:
+            variances[1:] /= max(float(line @ line), 1e-9)
+        if state.axes.point == 2:
+            origin, line = origin * [1.0, 1.0, 0.0], line * [1.0, 1.0, 0.0]
+        R_A, x_A = A[:3, :3], A[:3, 3]
+        return View(
+            int(event.ids[row]),
+            kind,
+            event.sensor_frame,
+            A,
+            R_A @ origin + x_A,
+            R_A @ line,
+            variances,
+            self.covariance,
+        )
+
+
+class Window:
+    """Views of a robot that is lost, along all of the way that is still known well.
+
+    They lie the farther apart the longer it is: all are kept until they are too many.
+    """
+
+    def __init__(self) -> None:
+        self.way = Way()
+        self.views: list[View] = []
+        self.seen = 0
+        self._last: dict[tuple[int, int, str], View] = {}
+        self._times = 1.0  # by how much farther apart they are than it takes
+
+    def add(self, state: State, event: ObservationEvent, row: int, covariance: FloatArray) -> None:
+        """Add the half point at ``row``, unless its landmark was seen nearby already."""
+        self.way.go_on(state, event.stamp_ns)
+        view, turned = self.way.view(state, event, row, covariance), state.axes.turned
+        if not self._takes(view):
+            return
+        self.seen += 1
+        if len(self.views) > MOST_VIEWS:
+            self._times *= 2.0
+            views, self._last = self.views, {}
+            self.views = [each for each in views if self._takes(each)]
+        uncertain = [view.walk - each.walk for each in self.views]
+        while uncertain and np.diagonal(uncertain[0])[turned].max() > MOST_TURN_RAD**2:
+            del uncertain[0], self.views[0]
+        self.views.append(view)
+
+    def _takes(self, view: View) -> bool:
+        """Return whether a view is not near the last one of the same, and note it."""
+        of = view.landmark_id, view.kind, view.sensor_frame
+        if of in self._last and self._last[of].is_near(view, self._times):
+            return False
+        self._last[of] = view
+        return True
 
 
 class WaitingRoom:
@@ -69,9 +173,7 @@ class WaitingRoom:
         self._views: dict[int, deque[View]] = {}
         self._seen: dict[int, int] = {}  # views of each, and …
         self._next: dict[int, int] = {}  # … how many it takes until it is tried again
-        self._walk = np.zeros((6, 6))
-        self._last_ns: int | None = None
-        self._last_pose = np.eye(4)
+        self._way = Way()
 
     def add(
         self, state: State, event: ObservationEvent, row: int, covariance: FloatArray
@@ -80,52 +182,28 @@ class WaitingRoom:
 
         Both are body axes, as the sensor would have shown the point now.
         """
-        self._walk_on(state, event.stamp_ns)
-        landmark_id, A = int(event.ids[row]), state.observer.A.copy()
-        R, shift, scale = sensor_values(state, event)
-        origin = event.points[row] - event.lines_of_sight[row] + shift
-        line = scale * (R @ event.lines_of_sight[row])
-        is_range = bool(np.asarray(event.kinds)[row] == RANGE)
-        basis = directions_of(line[None])[0]
-        variances = np.einsum('ij,jk,ik->i', basis, covariance, basis)
-        if not is_range:
-            variances = variances / max(float(line @ line), 1e-9)
-        if state.axes.point == 2:
-            origin, line = origin * [1.0, 1.0, 0.0], line * [1.0, 1.0, 0.0]
-        R_A, x_A = A[:3, :3], A[:3, 3]
-        view = View(A, R_A @ origin + x_A, R_A @ line, variances, self._walk, is_range)
+        self._way.go_on(state, event.stamp_ns)
+        view = self._way.view(state, event, row, covariance)
+        landmark_id = view.landmark_id
         views = self._views.setdefault(landmark_id, deque(maxlen=MOST_VIEWS))
-        if views and _is_near(views[-1], view):
+        if views and views[-1].is_near(view):
             return None
         views.append(view)
         seen = self._seen[landmark_id] = self._seen.get(landmark_id, 0) + 1
         if seen < self._next.get(landmark_id, FEWEST_VIEWS):
             return None
         self._next[landmark_id] = min(math.ceil(TRY_AGAIN * seen), seen + MOST_BETWEEN)
-        problem = _Problem(list(views), self._walk, state.axes.point)
+        problem = _Problem(list(views), self._way.covariance, state.axes.point)
         found = problem.solve(state.settings.range_scale_stddev)
         if found is None:
             return None
         for kept in (self._views, self._seen, self._next):
             del kept[landmark_id]
         point, of_point = found
-        in_body = R_A.T @ (point - view.origin)
-        turned = R.T @ R_A.T
+        R, _, scale = sensor_values(state, event)
+        in_body = view.pose[:3, :3].T @ (point - view.origin)
+        turned = R.T @ view.pose[:3, :3].T
         return R.T @ in_body / scale, turned @ of_point @ turned.T / scale**2
-
-    def _walk_on(self, state: State, stamp_ns: int) -> None:
-        """Add the noise of the way since the last view, in the frame of P°."""
-        A, settings = state.observer.A, state.settings
-        if self._last_ns is not None and stamp_ns > self._last_ns:
-            dt_s = to_s(stamp_ns - self._last_ns)
-            move = np.abs(se3.log(se3.inverse(self._last_pose) @ A))
-            density = np.array([*settings.angular_velocity_noise, *settings.linear_velocity_noise])
-            share = np.array([*settings.angular_scale_noise, *settings.linear_scale_noise])
-            variances = density**2 * dt_s + (share * move) ** 2
-            Ad = se3.adjoint(A)
-            self._walk = self._walk + (Ad * variances) @ Ad.T
-        if self._last_ns is None or stamp_ns > self._last_ns:
-            self._last_ns, self._last_pose = stamp_ns, A.copy()
 
 
 def sensor_values(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray, float]:
@@ -135,12 +213,6 @@ def sensor_values(state: State, event: ObservationEvent) -> tuple[FloatArray, Fl
         return np.eye(3), np.zeros(3), 1.0
     values = calibration.sensor(event.sensor_frame)
     return so3.exp(values[:3]), values[3:6], math.exp(values[6])
-
-
-def _is_near(one: View, other: View) -> bool:
-    turn = np.linalg.norm(se3.log(se3.inverse(one.pose) @ other.pose)[:3])
-    moved_m = float(np.linalg.norm(one.origin - other.origin))
-    return moved_m < LEAST_MOVE_M and float(turn) < LEAST_TURN_RAD
 
 
 class _Problem:
