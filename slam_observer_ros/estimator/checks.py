@@ -34,8 +34,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import are_covariances, MAX_DEVIATION, transpose
-from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
-from slam_observer_ros.known_map.map_correlations import check_joint
+from slam_observer_ros.known_map.landmark_map import check_joint, LandmarkMap, MAX_NUMBER
 from slam_observer_ros.observer.gains import Gains
 from slam_observer_ros.observer.landmark_table import LandmarkTable
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings

@@ -9,9 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
+from slam_observer_ros.geometry.matrices import (
+    COVARIANCE_ROUNDING,
+    diagonal_blocks,
+    in_own_deviations,
+    LEAST_DEVIATION,
+    limited,
+    MAX_DEVIATION,
+)
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks, part_of_joint, tags_among
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 
@@ -23,6 +31,9 @@ SAME_SHARE = 0.9
 
 ROUNDED_M = 1e-3
 """By how much positions differ that somebody wrote down in millimetres."""
+
+MAX_CORRELATED = 1000
+"""Landmarks of a map up to which correlations are saved, in 46 MB then."""
 
 MAX_NUMBER = 1e12
 """Metres; nothing larger is meant seriously, and its square still has all digits."""
@@ -255,3 +266,23 @@ def heights_of(maps: Iterable[LandmarkMap]) -> dict[int, float]:
             known.ids.tolist(), known.world_points[:, 2].tolist(), strict=True
         )
     }
+
+
+def check_joint(joint: FloatArray, covariances: FloatArray) -> None:
+    """Check a joint covariance of n or more vectors against those of the landmarks (n, 3, 3).
+
+    Raise :exc:`MapError` if there are others on its diagonal, or it is none.
+    """
+    joint = np.asarray(joint, dtype=np.float64)
+    blocks, scaled = diagonal_blocks(joint, 3)[: len(covariances)], in_own_deviations(joint)
+    deviations = np.sqrt(np.maximum(np.diagonal(blocks, axis1=1, axis2=2), LEAST_DEVIATION**2))
+    differences = np.abs(blocks - covariances) / (deviations[:, :, None] * deviations[:, None, :])
+    if differences.max(initial=0.0) > COVARIANCE_ROUNDING:
+        raise MapError('a landmark has another covariance there')
+    if np.abs(scaled - scaled.T).max() > COVARIANCE_ROUNDING:
+        raise MapError('they are not symmetric')
+    scaled[np.diag_indices(len(scaled))] += COVARIANCE_ROUNDING
+    try:
+        np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError as error:
+        raise MapError('they are negative in some direction') from error

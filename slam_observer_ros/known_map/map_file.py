@@ -12,20 +12,31 @@ The same format serves saved maps and surveyed ones. A surveyor writes no more t
 ``covariance`` (m²) instead, ``observations`` (how often each landmark was seen), and in its head
 the ``package_version`` and ``settings`` with which it was made. A tag may have an ``orientation``,
 a quaternion x y z w from its own axes, and its ``orientation_sigma``, rad, about each axis. Below
-the landmarks of a saved map a line says how their errors are correlated; see
-:mod:`.map_correlations`.
+the landmarks of a saved map a line says how their errors are correlated::
+
+    correlations: {checksum: 2596996162, data: "eJwBCA…"}
+
+``data`` is the covariance of x y z of all landmarks together, m², in the order of the file, and
+then of the rotation vectors, along the axes of the map, of those with an orientation, rad². Of its
+rows it has the entries up to the diagonal as little-endian 64-bit floats, compressed by zlib, in
+base64. ``checksum`` is the CRC-32 of what the lines of the landmarks say, as floats of the same
+kind: of each its id, position, sigma or covariance, orientation and orientation_sigma. So nobody
+changes a landmark, and leaves correlations that are not those of the new one.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import dataclasses
 import logging
 from pathlib import Path
 import re
 import tempfile
 from typing import Any
+import zlib
 
 import numpy as np
 import yaml
@@ -47,8 +58,12 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import are_covariances
-from slam_observer_ros.known_map import map_correlations
-from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_NUMBER
+from slam_observer_ros.known_map.landmark_map import (
+    check_joint,
+    LandmarkMap,
+    MAX_CORRELATED,
+    MAX_NUMBER,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -60,6 +75,10 @@ _MAX_INT64 = 2**63 - 1
 
 _ROUNDED_NORM = 1e-2
 """By how much the norm of a quaternion that somebody wrote down may miss being one."""
+
+FIELDS = ('checksum', 'data')
+
+_COUNTED = ('id', 'position', 'sigma', 'covariance', 'orientation', 'orientation_sigma')
 
 _OPTIONAL = ('sigma', 'covariance', 'observations', 'orientation', 'orientation_sigma')
 
@@ -102,7 +121,7 @@ def write_map(
         }
     landmarks = _as_mappings(landmark_map)
     lines = [f'- {_on_one_line(landmark)}' for landmark in landmarks]
-    lines += map_correlations.as_lines(landmark_map.joint_covariance, landmarks)
+    lines += _correlation_lines(landmark_map.joint_covariance, landmarks)
     try:
         with unfinished_file(path) as file:
             yaml.safe_dump(head, file, sort_keys=False)
@@ -274,7 +293,7 @@ def _parse(content: Any) -> LandmarkMap:
     )
     if 'correlations' not in content:
         return landmark_map
-    joint = map_correlations.parse(content['correlations'], rows, landmark_map.covariances)
+    joint = _correlations(content['correlations'], rows, landmark_map.covariances)
     return dataclasses.replace(landmark_map, joint_covariance=joint)
 
 
@@ -374,3 +393,90 @@ def _numbers(value: Any, count: int, what: str) -> list[float]:
 def _expect(holds: bool, message: str) -> None:
     if not holds:
         raise MapError(message)
+
+
+def _correlation_lines(
+    joint: FloatArray | None, landmarks: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """Return the line for a joint covariance of ``landmarks`` as they are written.
+
+    And no line where there is none, or with a warning where it is too large.
+    """
+    if joint is None:
+        return []
+    if len(landmarks) > MAX_CORRELATED:
+        logger.warning('%s', found('left_out_correlations', count=len(landmarks)))
+        return []
+    triangle = joint[np.tril_indices(len(joint))].astype('<f8')
+    # Runs are what there is to find, those of zeros in planar maps: at a third of the time.
+    packing = zlib.compressobj(level=1, strategy=zlib.Z_RLE)
+    packed = packing.compress(triangle.tobytes()) + packing.flush()
+    data = base64.b64encode(packed).decode('ascii')
+    return [f'correlations: {{checksum: {_checksum(landmarks)}, data: "{data}"}}\n']
+
+
+def _correlations(
+    content: Any, landmarks: Sequence[Mapping[str, Any]], covariances: FloatArray | None
+) -> FloatArray:
+    """Return the joint covariance of ``landmarks`` as they were read.
+
+    Raise :exc:`MapError` if it can't be right, or is not that of these landmarks, whose
+    own ``covariances`` (n, 3, 3), m², are known.
+    """
+    try:
+        return _checked_correlations(content, landmarks, covariances)
+    except MapError as error:
+        raise MapError(
+            f"its 'correlations' can't be used, {error}: delete the line that begins with "
+            "'correlations:', and errors count as independent"
+        ) from error
+
+
+def _checked_correlations(
+    content: Any, landmarks: Sequence[Mapping[str, Any]], covariances: FloatArray | None
+) -> FloatArray:
+    if not isinstance(content, dict) or set(content) != set(FIELDS):
+        raise MapError(f'they are not of the form {{{FIELDS[0]}: …, {FIELDS[1]}: …}}')
+    if content['checksum'] != _checksum(landmarks):
+        raise MapError('a landmark was added, removed, moved or changed since')
+    if covariances is None:
+        raise MapError('the landmarks have no covariances')
+    tags = sum('orientation' in row for row in landmarks)
+    joint = _decoded(content['data'], 3 * (len(landmarks) + tags))
+    check_joint(joint, covariances)
+    return joint
+
+
+def _decoded(data: Any, size: int) -> FloatArray:
+    """Return the symmetric matrix (size, size)."""
+    if not isinstance(data, str):
+        raise MapError(f"'data' is {shown(data)}, no text")
+    rows, columns = np.tril_indices(size)
+    expected = 8 * len(rows)
+    try:
+        unpacking = zlib.decompressobj()
+        # No more than is expected, whatever is packed there.
+        raw = unpacking.decompress(base64.b64decode(data, validate=True), expected + 1)
+    except (binascii.Error, ValueError, zlib.error) as error:
+        raise MapError(f"'data' is damaged ({error})") from error
+    if len(raw) != expected or not unpacking.eof or unpacking.unused_data:
+        vectors = f'{size // 3} positions and orientations'
+        raise MapError(f"'data' does not have {expected} bytes, as of {vectors}")
+    values = np.frombuffer(raw, '<f8').astype(np.float64)
+    if not np.isfinite(values).all():
+        raise MapError('an entry is NaN or infinite')
+    matrix = np.empty((size, size))
+    matrix[rows, columns] = matrix[columns, rows] = values
+    return matrix
+
+
+def _checksum(landmarks: Sequence[Mapping[str, Any]]) -> int:
+    numbers = [number for row in landmarks for number in _counted(row)]
+    return zlib.crc32(np.array(numbers, dtype='<f8').tobytes())
+
+
+def _counted(row: Mapping[str, Any]) -> Iterator[float]:
+    """Yield what a landmark's line says, in one order."""
+    for name in _COUNTED:
+        if name in row:
+            yield from np.ravel(row[name]).tolist()

@@ -22,9 +22,8 @@ from slam_observer_ros.geometry.matrices import (
     diagonal_blocks,
     with_variances_above,
 )
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.landmark_map import LandmarkMap, MAX_CORRELATED
 from slam_observer_ros.known_map.map_alignment import find_transform
-from slam_observer_ros.known_map.map_correlations import MAX_CORRELATED
 from slam_observer_ros.observer.known_landmarks import JITTER_M2, KnownLandmarks
 from slam_observer_ros.state.state import State
 

@@ -23,7 +23,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR
 from slam_observer_ros.geometry.matrices import diagonal_blocks
 from slam_observer_ros.geometry.se3 import rigid_alignment
-from slam_observer_ros.known_map import map_correlations, merging
+from slam_observer_ros.known_map import map_file, merging
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.observer.arrays import SeenOrientations
@@ -89,7 +89,7 @@ class TestFile:
     def test_those_of_too_many_landmarks_are_left_out_with_a_warning(
         self, tmp_path, monkeypatch, caplog
     ):
-        monkeypatch.setattr(map_correlations, 'MAX_CORRELATED', 5)
+        monkeypatch.setattr(map_file, 'MAX_CORRELATED', 5)
         path = write(tmp_path / 'map.yaml', a_map(6))
         assert 'Correlations between the 6 landmarks of the map are not saved' in caplog.text
         assert read_map(path).joint_covariance is None
