@@ -69,7 +69,8 @@ OUTPUTS = {
     'where the gains know them',
     'landmark_estimates': 'the same landmarks for tools that read PointCloud; not published if '
     'an id is 2²⁴ or more, which its float32 channel cannot hold',
-    'markers': 'landmarks and residuals; for the first 200 landmarks also ids and 3σ ellipsoids; '
+    'markers': 'landmarks and residuals, circles for distances alone and lines for directions '
+    'alone; for the first 200 landmarks also ids and 3σ ellipsoids; '
     'while the robot is lost in a map, arrows at the places that fit what it sees, '
     'for RViz and Foxglove',
     'lyapunov': 'the Lyapunov value L (34) of the last observation',

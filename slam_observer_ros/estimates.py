@@ -196,6 +196,7 @@ class Update:
     lyapunov: float
     moved_ids: IntArray
     innovation: NormalisedInnovation | None = None
+    kinds: IntArray | None = None  # (m,) of half points, as events have them; None: whole ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,6 +293,7 @@ class Instant:
     landmark_covariances: FloatArray | None  # (n, 3, 3) world, m²
     calibration: tuple[CalibrationEstimate, ...]
     dropped: Counter[str]  # messages so far, by reason
+    seen: Update | None = None  # what was seen last, if that was lately
 
 
 @dataclass(frozen=True, slots=True, eq=False)

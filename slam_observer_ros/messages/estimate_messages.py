@@ -19,6 +19,7 @@ import numpy as np
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Update
+from slam_observer_ros.events import AZIMUTH, BEARING, RANGE
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import ENCAPSULATION_BYTES, encode_string
 from slam_observer_ros.messages.outgoing import OutgoingMessages
@@ -36,6 +37,11 @@ WHITE = (1.0, 1.0, 1.0, 1.0)
 PALE_GREEN = (0.0, 0.62, 0.45, 0.3)
 ORANGE = (0.84, 0.37, 0.0, 1.0)
 
+SKY = (0.34, 0.71, 0.91, 0.8)
+
+MAX_RINGS = 20  # of 36 lines each
+RING = np.linspace(0.0, 2.0 * np.pi, 37)
+
 MAX_LABELS = 200  # more could not be read, and each is a message of its own
 ELLIPSOID_SIGMAS = 3.0  # half axes, in standard deviations
 MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
@@ -43,6 +49,25 @@ MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
 # Of visualization_msgs/Marker
 ADD, DELETEALL = 0, 3
 ARROW, SPHERE, LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING = 0, 2, 5, 7, 9
+
+
+def half_sights(
+    update: Update, ids: IntArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what was measured of landmarks ``ids`` (n,) at ``points`` (n, 3) by half, metres.
+
+    Of distances (r, 3): x, y of the landmark and the radius, in the plane, of a circle on which
+    the robot is. Of directions (b, 3): the point in that direction that is as far as the landmark.
+    """
+    if update.kinds is None:
+        return np.empty((0, 3)), np.empty((0, 3))
+    _, seen, rows = np.intersect1d(update.ids, ids, return_indices=True)
+    kinds, centres = update.kinds[seen], points[rows]
+    ends = centres + update.residuals[seen]
+    radii = np.linalg.norm((ends - update.pose[:3, 3])[:, :2], axis=1)
+    is_range = kinds == RANGE
+    rings = np.column_stack([centres[is_range, :2], radii[is_range]])
+    return rings, ends[np.isin(kinds, (BEARING, AZIMUTH))]
 
 
 class EstimateMessages:
@@ -105,7 +130,8 @@ class MarkerMessages:
     ) -> Any:
         """Return markers that replace all earlier ones.
 
-        They are points, ids, the last residuals and, where covariances are known, ellipsoids.
+        They are points, ids, the last residuals, distances and directions, and, where covariances
+        are known, ellipsoids.
         """
         if not len(points):
             return self.none(stamp_ns)
@@ -118,7 +144,8 @@ class MarkerMessages:
         ]
         lines = self._residual_lines(header, ids, points, update)
         ellipsoids = self._ellipsoids(header, points, covariances)
-        drawn = [self._points(header, points), lines, *ellipsoids, *labels]
+        halves = [] if update is None else self._halves(header, ids, points, update)
+        drawn = [self._points(header, points), lines, *halves, *ellipsoids, *labels]
         return self._array([self._removal(header), *drawn])
 
     def places(self, stamp_ns: int, poses: FloatArray) -> Any:
@@ -178,6 +205,28 @@ class MarkerMessages:
             lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
             marker.points = [self._messages.point(point) for point in lines]
         return marker
+
+    def _halves(self, header: Any, ids: IntArray, points: FloatArray, update: Update) -> list[Any]:
+        """Return circles of distances about their landmarks, and lines in directions, if any."""
+        rings, ends = half_sights(update, ids, points)
+        robot = update.pose[:3, 3]
+        around = np.column_stack([np.cos(RING), np.sin(RING)])
+        circles = [
+            np.column_stack([ring[:2] + ring[2] * around, np.full(len(RING), robot[2])])
+            for ring in rings[:MAX_RINGS]
+        ]
+        pairs = {
+            'ranges': [np.stack([circle[:-1], circle[1:]], axis=1) for circle in circles],
+            'bearings': [np.stack([np.tile(robot, (len(ends), 1)), ends], axis=1)],
+        }
+        markers = []
+        for namespace, lines in pairs.items():
+            marker = self._marker(header, namespace, LINE_LIST, SKY, LINE_WIDTH_M)
+            joined = np.concatenate([np.empty((0, 3)), *(each.reshape(-1, 3) for each in lines)])
+            marker.points = [self._messages.point(point) for point in joined]
+            if marker.points:
+                markers.append(marker)
+        return markers
 
     def _label(self, header: Any, number: int, landmark_id: int, point: FloatArray) -> Any:
         marker = self._marker(header, 'ids', TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)

@@ -18,6 +18,7 @@ from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.estimates import Reason
 from slam_observer_ros.evaluation.trajectory import interpolate
+from slam_observer_ros.messages.estimate_messages import half_sights
 from slam_observer_ros.report.curves import (
     calibration,
     consistency,
@@ -157,6 +158,12 @@ def _instants(run: ReportedRun) -> dict[str, Json]:
     some = run.instants[thinned(total, MAX_ELLIPSES)]
     seconds = run.seconds(np.array([instant.stamp_ns for instant in some], dtype=np.int64))
     poses = np.array([instant.pose for instant in some]).reshape(-1, 4, 4)
+    halves = [
+        (np.empty((0, 3)), np.empty((0, 3)))
+        if instant.seen is None
+        else half_sights(instant.seen, instant.ids, instant.world_points)
+        for instant in some
+    ]
     return {
         't': rounded(seconds, 2),
         'xyz': rounded(poses[:, :3, 3], 3),
@@ -165,6 +172,8 @@ def _instants(run: ReportedRun) -> dict[str, Json]:
         'ids': [instant.ids.tolist() for instant in some],
         'points': [rounded(instant.world_points.T, 3) for instant in some],
         'covariances': [_covariances(instant.landmark_covariances) for instant in some],
+        'rings': [rounded(rings, 3) for rings, _ in halves],
+        'rays': [rounded(ends, 3) for _, ends in halves],
     }
 
 

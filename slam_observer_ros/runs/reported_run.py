@@ -137,7 +137,13 @@ class NisTally:
         return self._nis / total if total else None
 
 
+LATELY_NS = 1_000_000_000
+"""How long ago an observation may be that an instant shows."""
+
+
 def _instant(estimator: Estimate, stamp_ns: int) -> Instant:
+    last = estimator.last_update
+    is_late = last is None or not 0 <= stamp_ns - last.stamp_ns < LATELY_NS
     return Instant(
         stamp_ns=stamp_ns,
         pose=estimator.pose,
@@ -147,6 +153,7 @@ def _instant(estimator: Estimate, stamp_ns: int) -> Instant:
         landmark_covariances=estimator.landmark_covariances,
         calibration=tuple(estimator.calibration),
         dropped=estimator.dropped.copy(),
+        seen=None if is_late else last,
     )
 
 

@@ -120,12 +120,14 @@ class HalfPoints:
 
 def judged(update: Update, event: ObservationEvent, state: State) -> Update:
     """Return what came of a completed observation without the directions not measured."""
-    innovation = update.innovation
-    if event.kinds is None or innovation is None:
+    if event.kinds is None:
         return update
-    k = state.axes.point
     by_id = dict(zip(event.ids.tolist(), event.kinds.tolist(), strict=True))
     kinds = np.array([by_id.get(each, POINT) for each in update.ids.tolist()], dtype=np.int64)
+    update, innovation = replace(update, kinds=kinds), update.innovation
+    if innovation is None:
+        return update
+    k = state.axes.point
     missing = k - measured_directions(kinds, k)
     unmeasured = missing * (math.log(UNMEASURED_M) + _LOG_ROOT_2_PI)
     used = innovation.weights > 0.0

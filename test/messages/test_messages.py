@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import struct
 
 import detector_messages as detector
@@ -12,11 +13,13 @@ import pytest
 import ros_messages as ros
 
 from slam_observer_ros.common.errors import MessageError
-from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.events import BEARING, IMPOSSIBLE_ID, MAX_ID, POINT, RANGE
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.messages import clouds, poses
 from slam_observer_ros.messages.estimate_messages import (
     encode_transform,
+    MarkerMessages,
     StateMessages,
     uncertain_pose,
 )
@@ -605,3 +608,34 @@ def test_rclpy_serialises_the_same_bytes():
     event = clouds.decode_point_cloud2(published[-2])
     assert event.ids.tolist() == [4, -1]
     assert event.points.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
+
+
+class TestMarkers:
+    """What is drawn of half points."""
+
+    def test_distances_are_circles_and_directions_lines(self):
+        points = np.array([[3.0, 4.0, 1.0], [0.0, 2.0, 0.0], [5.0, 5.0, 5.0]])
+        update = Update(
+            stamp_ns=0,
+            pose=np.eye(4),
+            ids=np.array([9, 4, 7]),
+            residuals=np.array([[0.0, 0.5, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 0.0]]),
+            rejected=np.zeros(3, bool),
+            lyapunov=0.0,
+            moved_ids=np.empty(0, np.int64),
+            kinds=np.array([BEARING, RANGE, POINT]),
+        )
+        drawn = MarkerMessages(ros.OUTGOING, 'map').landmarks(
+            0, np.array([4, 9, 7]), points, None, update
+        )
+        by_namespace = {marker.ns: marker for marker in drawn.markers}
+        ring = np.array([[p.x, p.y, p.z] for p in by_namespace['ranges'].points])
+        radii = np.linalg.norm(ring[:, :2] - points[0, :2], axis=1)
+        np.testing.assert_allclose(radii, np.hypot(3.6, 4.8))
+        assert set(ring[:, 2]) == {0.0}, 'as high as the robot'
+        (start, end) = by_namespace['bearings'].points
+        assert (start.x, start.y, start.z, end.x, end.y, end.z) == (0, 0, 0, 0, 2.5, 0)
+        whole = MarkerMessages(ros.OUTGOING, 'map').landmarks(
+            0, np.array([4, 9, 7]), points, None, replace(update, kinds=None)
+        )
+        assert {marker.ns for marker in whole.markers}.isdisjoint({'ranges', 'bearings'})

@@ -17,7 +17,7 @@ from recordings import events, MESSAGE_COUNT, SAMPLE, write_events, write_mcap
 from slam_observer_ros import __version__
 from slam_observer_ros.cli.main import main
 from slam_observer_ros.evaluation.consistency import ellipses
-from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.events import BEARING, ObservationEvent, RANGE
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.error_health import growth_windows
 
@@ -317,6 +317,36 @@ def test_a_click_on_a_landmark_shows_what_came_of_each_observation(report):
     (first, *_) = numbers_of(report)['landmarks']
     shown = f'Landmark {first[0]},false,new in the map,true,true'
     assert run_in_page(report, script) == shown
+
+
+@pytest.mark.parametrize('kind', [RANGE, BEARING])
+def test_distances_and_directions_alone_are_drawn(slam_observer, tmp_path, kind):
+    known, report = tmp_path / 'known.yaml', tmp_path / 'run.html'
+    recording = write_mcap(tmp_path / 'whole.mcap')
+    slam_observer.succeed('replay', recording, '--map', known)
+    halves = []
+    for event in events():
+        if isinstance(event, ObservationEvent):
+            ranges = np.linalg.norm(event.points, axis=1)[:, None]
+            points = ranges * [1.0, 0.0, 0.0] if kind == RANGE else event.points / ranges
+            event = replace(event, points=points, kinds=np.full(len(points), kind))
+        halves.append(event)
+    options = ('--load-map', known, '--set', 'set_initial_pose=true', '--report', report)
+    slam_observer('replay', write_events(tmp_path / 'half.mcap', halves), *options)
+    instants = numbers_of(report)['instants']
+    drawn, other = instants['rings'], instants['rays']
+    drawn, other = (drawn, other) if kind == RANGE else (other, drawn)
+    assert {len(each) for each in drawn} == {3}
+    assert {len(each) for each in other} == {0}
+    landmarks = np.transpose(instants['points'][5])
+    if kind == RANGE:
+        ring = np.array(instants['rings'][5])
+        np.testing.assert_allclose(ring[:, :2], landmarks[:, :2], atol=1e-3)
+        level = np.linalg.norm((landmarks - instants['xyz'][5])[:, :2], axis=1)
+        np.testing.assert_allclose(ring[:, 2], level, atol=0.15)  # a step of the robot
+    else:
+        np.testing.assert_allclose(instants['rays'][5], landmarks, atol=0.15)
+    assert 'distances, directions' in open_page(report).html
 
 
 def test_moving_the_slider_moves_the_robot(report):

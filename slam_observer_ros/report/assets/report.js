@@ -79,10 +79,27 @@ function stateAt(i, view) {
   /** @type {Curve} */ const ry = [];
   if (robot[i]) addEllipse(x, y, robot[i][0], view, rx, ry);
   const length = 0.04 * extent;
+  /* Distances alone are circles about their landmarks, in the plan; directions alone are lines. */
+  /** @type {Curve} */ const hx = [];
+  /** @type {Curve} */ const hy = [];
+  if (view === PLAN) {
+    run.instants.rings[i].forEach((/** @type {number[]} */ [cx, cy, radius]) => {
+      for (let n = 0; n <= 72; n += 1) {
+        hx.push(cx + radius * Math.cos(n * Math.PI / 36));
+        hy.push(cy + radius * Math.sin(n * Math.PI / 36));
+      }
+      hx.push(null);
+      hy.push(null);
+    });
+  }
+  run.instants.rays[i].forEach((/** @type {number[]} */ end) => {
+    hx.push(x, dot(end, view.across), null);
+    hy.push(y, dot(end, view.up), null);
+  });
   return {
-    x: [px, ex, rx, [x, x + length * dot(ahead[i], view.across)], [x]],
-    y: [py, ey, ry, [y, y + length * dot(ahead[i], view.up)], [y]],
-    text: [run.instants.ids[i].map((/** @type {number} */ id) => String(id)), null, null, null, null],
+    x: [px, ex, rx, [x, x + length * dot(ahead[i], view.across)], hx, [x]],
+    y: [py, ey, ry, [y, y + length * dot(ahead[i], view.up)], hy, [y]],
+    text: [run.instants.ids[i].map((/** @type {number} */ id) => String(id)), null, null, null, null, null],
   };
 }
 
@@ -90,6 +107,8 @@ const extent = (() => {
   const all = [0, 1].map((k) => run.path.xyz[k].filter((/** @type {number|null} */ v) => v !== null));
   return Math.max(...all.map((v) => (v.length ? v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.max(a, b)) - v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.min(a, b)) : 1)), 0.1);
 })();
+
+const hasHalves = [...run.instants.rings, ...run.instants.rays].some((/** @type {any[]} */ each) => each.length > 0);
 
 /** @param {boolean} isPlan @param {View} view */
 function mapFigure(isPlan, view) {
@@ -119,7 +138,8 @@ function mapFigure(isPlan, view) {
     { x: first.x[1], y: first.y[1], mode: 'lines', name: '95 %, landmarks', line: { color: GREEN, width: 1.5 }, hoverinfo: 'skip' },
     { x: first.x[2], y: first.y[2], mode: 'lines', name: '95 %, robot', line: { color: RED, width: 2 }, hoverinfo: 'skip' },
     { x: first.x[3], y: first.y[3], mode: 'lines', showlegend: false, line: { color: RED, width: 3 }, hoverinfo: 'skip' },
-    { x: first.x[4], y: first.y[4], mode: 'markers', name: 'robot', marker: { size: 10, color: RED, line: { color: '#fff', width: 1 } }, hoverinfo: 'skip' },
+    { x: first.x[4], y: first.y[4], mode: 'lines', name: 'distances, directions', showlegend: hasHalves, line: { color: SKY, width: 1 }, hoverinfo: 'skip' },
+    { x: first.x[5], y: first.y[5], mode: 'markers', name: 'robot', marker: { size: 10, color: RED, line: { color: '#fff', width: 1 } }, hoverinfo: 'skip' },
   );
   const axis = { gridcolor: grid(), zeroline: false, automargin: true };
   /** @type {any} */
@@ -332,7 +352,7 @@ function update() {
     const place = element(String(id));
     if (!place.dataset.still) return;
     const still = Number(place.dataset.still), state = stateAt(i, /** @type {View} */ (view));
-    Plotly.restyle(place, { x: state.x, y: state.y, text: state.text.map((text) => text || '') }, [0, 1, 2, 3, 4].map((n) => still + n));
+    Plotly.restyle(place, { x: state.x, y: state.y, text: state.text.map((text) => text || '') }, [0, 1, 2, 3, 4, 5].map((n) => still + n));
   });
   if (printing) return;
   Plotly.relayout('curves', { 'shapes[0].x0': t, 'shapes[0].x1': t });
