@@ -27,7 +27,6 @@ static const double MIN_SHARE = 1e-6, MOST_SHARE_M2 = 1e-6;
 static const double MIN_INTERVAL_S = 1e-3;
 static const double LOST = 1e-7;             /* matrices.py */
 static const double LOG_ROOT_2_PI = 0.9189385332046728;
-static const double CLEARLY = 3.0;           /* robust.py */
 static const int REWEIGHTINGS = 2;
 static const i64 LATEST_NS = (i64)1 << 61;   /* stamps beyond it are unusual: no sum overflows */
 static const i64 DELAY = 42; /* which entry of a calibration it is, behind those of [M b] */
@@ -899,32 +898,6 @@ static void fill_predicted(const Estimate *x, const Observed *out, Residuals *re
     }
 }
 
-/* The squared distance of what the others leave of residual i, K_i (S^-1 r)_i, by its covariance
- * K_i = ((S^-1)_ii)^-1; 0 if it is not far by the sensor's noise alone. ``work``: M k. */
-static double by_the_others(const Residuals *res, long i, double gate, double *work) {
-    int k = res->k;
-    double information[9] = {0.0}, left[3], sum = 0.0;
-    for (int b = 0; b < k; b++) { /* columns of L^-1 */
-        double *column = work + b * res->M;
-        memset(column, 0, (size_t)res->M * sizeof(double));
-        column[k * i + b] = 1.0;
-        solve_lower(res->L, res->M, column);
-        left[b] = res->S_inv_r[k * i + b];
-    }
-    for (int b = 0; b < k; b++)
-        for (int t = 0; t < k; t++)
-            for (long l = 0; l < res->M; l++)
-                information[k * b + t] += work[b * res->M + l] * work[t * res->M + l];
-    if (!factor(information, k))
-        return 0.0;
-    solve_lower(information, k, left);
-    solve_upper(information, k, left);
-    for (int b = 0; b < k; b++)
-        sum += left[b] * res->S_inv_r[k * i + b];
-    double square = squared_distance(left, res->R + k * k * i, k);
-    return square >= 0.0 && sqrt(square) > CLEARLY * gate ? sum : 0.0;
-}
-
 /* How far off each residual was, its density given those before it, shares; then all together. */
 static void write_judged(const Residuals *res, double *judged) {
     long m = res->m, M = res->M;
@@ -959,28 +932,14 @@ static int judge(const Estimate *x, const Limits *limits, const Observed *out, R
     memcpy(res->S_inv_r, res->z, (size_t)M * sizeof(double));
     solve_upper(res->L, M, res->S_inv_r);
     /* No residual is further out than all of them together are. */
-    if (sum_of_squares(res->z, M) <= gate * gate)
-        return DONE;
-    for (long i = 0; i < res->m; i++) {
-        copy_block(res->S, M, i, k, block);
-        double square = squared_distance(res->r + k * i, block, k);
-        out->weights[i] = square >= 0.0 && sqrt(square) <= gate;
-        status = out->weights[i] == 0.0 ? REJECTS : status;
-    }
-    if (status == REJECTS || res->m < 2)
-        return status;
-    double furthest = gate * gate;
-    long odd = -1;
-    for (long i = 0; i < res->m; i++) {
-        double square = by_the_others(res, i, gate, res->W);
-        if (square > furthest)
-            furthest = square, odd = i;
-    }
-    if (odd < 0)
-        return DONE;
-    for (long i = 0; i < res->m; i++) /* of two, nothing shows which one is right */
-        out->weights[i] = i != odd && res->m > 2;
-    return REJECTS;
+    if (sum_of_squares(res->z, M) > gate * gate)
+        for (long i = 0; i < res->m; i++) {
+            copy_block(res->S, M, i, k, block);
+            double square = squared_distance(res->r + k * i, block, k);
+            out->weights[i] = square >= 0.0 && sqrt(square) <= gate;
+            status = out->weights[i] == 0.0 ? REJECTS : status;
+        }
+    return status;
 }
 
 /* g and F of motion_noise.py, from u = C' S^-1 r and G = C' S^-1 C. */

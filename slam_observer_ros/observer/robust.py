@@ -2,7 +2,7 @@
 
 The usual step has both once more (observer/step.py and observer/_core.c); in smoothing, a weight
 that falls off takes the gate's place (smoothing/observations.py). Where the state is uncertain
-the gate is wide, and outliers pass it, unless others show where they should be: :func:`odd_ones`.
+the gate is wide, and outliers pass it.
 
 Residuals r are (m, k), metres; ``predicted`` (m k, m k) is their covariance C P Cᵀ without the
 ``noise`` (m, k, k) of the observations, m².
@@ -16,23 +16,15 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry.matrices import (
-    definite_inverse,
     diagonal_blocks,
     mahalanobis,
     solve_definite,
-    solve_symmetric,
     with_blocks,
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 
 AT_ONCE = 32
 """Points that are used at once. Of more, each block of so many is judged after the one before."""
-
-CLEARLY = 3.0
-"""How many times the gate the odd one must be off, by the sensor's noise alone.
-
-The state's errors are linearised: large ones explain more than their covariance says.
-"""
 
 REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
@@ -79,37 +71,10 @@ def accepted(distances: FloatArray, gate: float) -> BoolArray:
 def gated(
     r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: float
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which observations (m,) pass the gate, and their part of ``predicted``.
-
-    First each of them alone, then without the odd ones, one after the other.
-    """
+    """Return which observations (m,) pass the gate, and their part of ``predicted``."""
     passed = accepted(distances(r, predicted, noise), gate)
-    while True:
-        used = np.flatnonzero(np.repeat(passed, r.shape[1]))
-        predicted_passed = predicted[used][:, used]
-        odd = odd_ones(r[passed], predicted_passed, noise[passed], gate)
-        if not odd.any():
-            return passed, predicted_passed
-        passed[passed] = ~odd
-
-
-def odd_ones(r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: float) -> BoolArray:
-    """Return which observation (m,) is the furthest off by all others, if beyond the gate.
-
-    As one with a wrong id is after a stretch without landmarks. Of two both are odd then: nothing
-    shows which of them is right.
-    """
-    odd, m = np.zeros(len(r), dtype=np.bool_), len(r)
-    if m < 2:
-        return odd
-    information = definite_inverse(with_blocks(predicted, noise))
-    S_inv_r = (information @ r.ravel()).reshape(*r.shape, 1)
-    # The rest of the residual r_i, after all others, K_i (S⁻¹ r)_i, and its K_i = ((S⁻¹)_ii)⁻¹.
-    left = solve_symmetric(diagonal_blocks(information, r.shape[1]), S_inv_r)
-    squares = np.einsum('ijt,ijt->i', left, S_inv_r)
-    squares[mahalanobis(left[:, :, 0], noise) <= CLEARLY * gate] = 0.0
-    odd[np.argmax(squares) if m > 2 else slice(None)] = squares.max() > gate**2
-    return odd
+    used = np.flatnonzero(np.repeat(passed, r.shape[1]))
+    return passed, predicted[used][:, used]
 
 
 def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import axes_of, EstimatedAxes
 from slam_observer_ros.geometry.matrices import (
@@ -45,7 +45,6 @@ from slam_observer_ros.observer.flat_arrays import (
 from slam_observer_ros.observer.robust import (
     accepted,
     huber_weights,
-    odd_ones,
     REWEIGHTINGS,
 )
 from slam_observer_ros.sensor_models.calibration import calibrated, with_moves
@@ -278,8 +277,8 @@ def observe(
     learnt = None if factors is None else _learnt(factors, residuals, judged.S, limits.gate)
     if factors is not None and learnt is None:
         return UNUSUAL
-    if not (passed := _passed(residuals, judged, limits.gate)).all():
-        out.weights[:] = passed
+    if judged.distances is not None and not accepted(judged.distances, limits.gate).all():
+        out.weights[:] = accepted(judged.distances, limits.gate)
         _take_over(factors, learnt)
         return REJECTS
     weights = _weights(residuals, judged, limits)
@@ -401,17 +400,6 @@ def _judged(x: Estimate, residuals: _Residuals, limits: Limits) -> _Judged | Non
     if residuals.flat.dot(S_inv_r) > limits.gate**2:
         distances = mahalanobis(residuals.r[:, : axes.point], diagonal_blocks(S, axes.point))
     return _Judged(predicted, S, L, S_inv_r, distances)
-
-
-def _passed(residuals: _Residuals, judged: _Judged, gate: float) -> BoolArray:
-    """Return which points (m,) pass the gate, but for an odd one if all do."""
-    if judged.distances is None:
-        return np.ones(len(residuals.r), dtype=np.bool_)
-    passed = accepted(judged.distances, gate)
-    if passed.all():
-        r = residuals.r[:, : residuals.axes.point]
-        return ~odd_ones(r, judged.predicted, residuals.R, gate)
-    return passed
 
 
 def _learnt(

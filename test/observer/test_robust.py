@@ -17,7 +17,6 @@ from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis
 from slam_observer_ros.observer.robust import (
     huber_weights,
     observation_weights,
-    odd_ones,
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -78,37 +77,13 @@ def test_the_gate_rejects_the_one_observation_that_is_far_off(rng, outlier, k):
 
 
 @given(generators(), st.floats(0.1, 20.0), st.sampled_from([2, 3]))
-def test_an_observation_beyond_the_gate_is_rejected(rng, scale, k):
+def test_each_observation_is_gated_by_its_own_distance(rng, scale, k):
     """However far out the others are, with which it is correlated."""
     r, predicted, noise = random_problem(rng, k=k)
     own = np.einsum('ijik->ijk', predicted.reshape(len(r), k, len(r), k)) + noise
     distances = np.sqrt(scale**2 * np.einsum('ij,ijk,ik->i', r, np.linalg.inv(own), r))
     weights = observation_weights(scale * r, predicted, noise, Settings(rejection_threshold=6.0))
-    np.testing.assert_array_equal(weights[distances > 6.0], 0.0)
-
-
-@given(
-    generators(),
-    st.integers(1, 5),
-    st.floats(0.0, 1e3),
-    st.floats(0.0, 300.0),
-    st.sampled_from([2, 3]),
-)
-def test_the_odd_one_is_judged_by_what_all_others_predict(rng, m, spread, scale, k):
-    r, predicted, noise = random_problem(rng, m, k)
-    r, predicted = scale * r, spread * predicted
-    S, squares = predicted + block_diagonal(noise), np.zeros(m)
-    for i in range(m):
-        one, others = k * i + np.arange(k), np.delete(np.arange(k * m), k * i + np.arange(k))
-        gain = S[np.ix_(one, others)] @ np.linalg.inv(S[np.ix_(others, others)])
-        left = r[i] - gain @ r.ravel()[others]
-        K = S[np.ix_(one, one)] - gain @ S[np.ix_(others, one)]
-        if mahalanobis(left[None], noise[[i]])[0] > 3.0 * 6.0:
-            squares[i] = left @ np.linalg.solve(K, left)
-    expected = (squares == squares.max()) & (squares > 36.0)
-    if m < 3:  # nothing shows which of two is right, and a single one contradicts none
-        expected[:] = expected.any() and m == 2
-    np.testing.assert_array_equal(odd_ones(r, predicted, noise, 6.0), expected)
+    np.testing.assert_array_equal(weights == 0.0, distances > 6.0)
 
 
 POSTS = np.array([[2.0, 1.0, 0.0], [2.0, -1.0, 0.0], [6.0, 3.0, 0.0], [6.0, -4.0, 0.0]])
@@ -139,14 +114,15 @@ def drive_on_blindly(settings, wrong, is_stray_seen=False):
 @modes
 @pytest.mark.parametrize('wrong', [{2: 0, 3: 1}, {2: 1, 3: 0}], ids=str)
 @pytest.mark.parametrize('is_stray_seen', [False, True])
-def test_ids_that_contradict_each_other_after_a_blind_stretch_are_rejected(
+def test_wrong_ids_after_a_blind_stretch_are_put_right_by_right_ones(
     two_d_mode, wrong, is_stray_seen
 ):
-    """Where the robot is by then, right ones show later."""
+    """Seen once, they look like a loop closed; where the robot really is, others show later."""
     settings = Settings(two_d_mode=two_d_mode)
     errors_m, estimator = drive_on_blindly(settings, wrong, is_stray_seen)
+    assert errors_m[10] > 1.0  # an id is believed until something speaks against it
     assert max(errors_m[-5:]) < 0.2
-    assert estimator.counts['rejected_landmark'] == 2
+    assert estimator.counts['rejected_landmark'] > 0
     assert estimator.counts['moved_landmark'] == 0
 
 
@@ -167,9 +143,9 @@ def test_a_wrong_id_among_right_ones_after_a_blind_stretch_does_not_throw_the_po
         points = POSTS[[*named]] - ahead_m * (step >= 10)
         assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         assert estimator.add(ObservationEvent(stamp_ns, np.array([*named.values()]), points))
-        estimator.flush()
-        assert np.linalg.norm(estimator.pose[:3, 3] - ahead_m * (step >= 10)) < 0.2
-    assert estimator.counts['rejected_landmark'] == 1
+    estimator.flush()
+    assert np.linalg.norm(estimator.pose[:3, 3] - ahead_m) < 0.2
+    assert estimator.counts['moved_landmark'] == 0
 
 
 def test_a_rejected_observation_says_nothing_of_how_its_landmark_moves():
