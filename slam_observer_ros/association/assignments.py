@@ -74,7 +74,7 @@ def find_assignments(
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different poses, the most likely first.
 
-    ``state`` is that at the instant of ``event``, an observation of m points, ``index`` that of
+    ``state`` is at the instant of ``event``, an observation of m points, and ``index`` has
     its landmarks. A point without an id costs ``new_cost`` if it is of a new landmark. None costs
     more than ``budget``. Where the state ``is_alone``, costs matter only to each other.
     """

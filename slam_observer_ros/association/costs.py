@@ -115,7 +115,7 @@ class NewLandmarks:
         self._stamp_ns: int | None = None
 
     def cost(self, gate_cost: float) -> float:
-        """Return the cost; ``gate_cost`` is that of a point at the gate, and the most."""
+        """Return the cost; a point at the gate has ``gate_cost``, which is the most."""
         share = (self._new + SHARE_AT_FIRST * POINTS_AT_FIRST) / (self._points + POINTS_AT_FIRST)
         cost = gate_cost - 2.0 * math.log(share / RARE_SHARE)
         return min(max(cost, min(LEAST_COST, gate_cost)), gate_cost)

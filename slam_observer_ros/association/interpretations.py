@@ -67,7 +67,7 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
+    ``state`` is at its instant, ``index`` has its landmarks, ``matched`` is the observation
     with the landmarks that its ids name. Points taken for landmarks not seen before get
     ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
@@ -106,7 +106,7 @@ def is_contradicted(state: State, matched: MatchedObservation) -> bool:
 
 
 def may_name(state: State, matched: MatchedObservation) -> bool:
-    """Return whether a point's id may be that of a landmark which had none of its own so far."""
+    """Return whether a point's id may belong to a landmark which had no id so far."""
     all_are_known = len(matched.known.ids) == len(matched.rows) + len(matched.left_out)
     if all_are_known:
         return False

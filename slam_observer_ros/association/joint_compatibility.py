@@ -188,7 +188,7 @@ class JointSearch:
         return _Extensions(pairings, options, costs, rows, tails)
 
     def _are_taken(self, pairings: list[Pairing], options: IntArray) -> BoolArray:
-        """Return (b, o) whether the landmark of a pair is already that of another point."""
+        """Return (b, o) whether another point already has the landmark of a pair."""
         taken = np.array([self._pairs.landmarks[pairing.chosen] for pairing in pairings])
         same = self._pairs.landmarks[options][:, None] == taken[:, None]
         return np.asarray(same.any(axis=2))

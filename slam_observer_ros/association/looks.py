@@ -177,7 +177,7 @@ def product(moved: list[FloatArray]) -> FloatArray:
 
 
 def _motion_noise(state: State, pairs: Pairs, velocities: VelocityHistory) -> FloatArray:
-    """Return the covariance (p, p) of the motion between them, with that of its bias."""
+    """Return the covariance (p, p) of the motion between them, its bias included."""
     calibration, end_ns = state.calibration, pairs.event.stamp_ns
     # The velocities before are forgotten: they were off by as much.
     since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)

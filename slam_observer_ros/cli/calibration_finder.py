@@ -48,8 +48,8 @@ _PER_MEDIAN = 1.4826
 class Driven:
     """Per axis (6,), angular first: root mean square of the velocity, and its ``noise_share``.
 
-    That is the square of how noisy the mean between two observations is, over that of what it
-    usually is: by so much noise that passes for motion makes a scale too small. It is 1 on an
+    That is the variance of the mean between two observations over the variance which it
+    usually has: by so much noise that passes for motion makes a scale too small. It is 1 on an
     axis along which nothing moves.
     """
 
@@ -78,7 +78,7 @@ def opened(
 ) -> Settings:
     """Return settings that know little of all that is calibrated, but for those to be ``kept``.
 
-    With neither a surveyed map nor a scale of the wheels that is known, that of ranges is as
+    With neither a surveyed map nor a known scale of the wheels, the scale of ranges is as
     stated: nothing shows how large a map is, but noise in metres, which makes a smaller one more
     likely. Noise in proportion to the speed is
     taken to be the same all the time: as noisy velocities state it, those too small by chance
@@ -137,7 +137,7 @@ def _of_axes(stamps_ns: IntArray, V: FloatArray, every_ns: float) -> tuple[Float
 
 
 def _mean_squares(V: FloatArray, count: int) -> FloatArray:
-    """Return those of the means of so many velocities (k, q) in a row."""
+    """Return the deviations of the means of so many velocities (k, q) in a row."""
     count = min(count, len(V))
     means = V[: len(V) // count * count].reshape(-1, count, V.shape[1]).mean(axis=1)
     return np.asarray((means**2).mean(axis=0))

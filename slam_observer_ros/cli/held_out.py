@@ -166,7 +166,7 @@ class Material:
     landmark_map: LandmarkMap | None = None
 
     def likelihood(self, settings: Settings) -> Likelihood:
-        """Return that of the part to train on."""
+        """Return the figure of the part to train on."""
         return self.trained(settings)[1]
 
     def trained(self, settings: Settings) -> tuple[Estimator, Likelihood]:

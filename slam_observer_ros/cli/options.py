@@ -85,7 +85,7 @@ class Given:
 
     @property
     def values(self) -> dict[str, object]:
-        """All of them, those of ``--set`` in place of others."""
+        """All values; ``--set`` takes the place of others."""
         return {**self.config, **self.assigned}
 
 
@@ -233,7 +233,7 @@ def parse_value(text: str) -> object:
 
 
 def named(text: str) -> str:
-    """Take a name, as an argparse type: an empty one is a mistake, often that of a variable."""
+    """Take a name, as an argparse type: an empty one is a mistake, often an unset variable."""
     if not text:
         raise argparse.ArgumentTypeError('the name is empty; . is this directory')
     return text

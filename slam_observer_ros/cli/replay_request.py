@@ -94,7 +94,7 @@ class ReplayRequest:
 
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that of topics and inputs, which calibrate has, too."""
+    """Add the options of topics and inputs."""
     landmarks, ambiguous = (
         ', '.join(short_names('landmarks', is_ambiguous)) for is_ambiguous in (False, True)
     )
@@ -137,7 +137,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how a recording is replayed, beside those of settings."""
+    """Add the options that say how a recording is replayed, but for settings."""
     add_input_options(parser)
     parser.add_argument(
         '--load-map',
@@ -217,7 +217,7 @@ def select_inputs(
 def _with_base_frame(
     inputs: InputSettings, recording: Recording, selected: SelectedTopics
 ) -> InputSettings:
-    """Name the base frame, if the user doesn't: that of the velocities.
+    """Name the base frame, if the user doesn't: the frame of the velocities.
 
     If they name none it is the node's, if /tf has that; else, with a warning, the landmarks'.
     """

@@ -101,7 +101,7 @@ def _recorder(records: Records) -> RunRecorder | NisTally | None:
 
 
 def _frame_of_outputs(inputs: InputSettings, maps: Sequence[LandmarkMap]) -> str:
-    """Return the frame of what is written: that of the map that was loaded, if one was."""
+    """Return the frame of what is written: the loaded map's, if there is one."""
     if not maps or maps[0].frame_id == inputs.map_frame:
         return inputs.map_frame
     logger.warning(

@@ -49,7 +49,7 @@ class SimulatedRun:
     """What came of a simulated run.
 
     ``lyapunov`` (k,) is L (34) before each correction; ``times_s`` (k,) are since the start. The
-    ``decay`` is that of :func:`.fit_decay`. The poses ``estimate`` and ``truth`` have the
+    ``decay`` is found by :func:`.fit_decay`. The poses ``estimate`` and ``truth`` have the
     same p stamps, and so have ``landmark_tracks`` (p, n, 3) of the estimate, in its world, metres;
     they are NaN before the first sighting.
     """

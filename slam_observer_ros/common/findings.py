@@ -11,7 +11,7 @@ from enum import IntEnum
 
 
 class Level(IntEnum):
-    """How bad it is; the numbers are those of diagnostic_msgs/DiagnosticStatus."""
+    """How bad it is; the numbers are as in diagnostic_msgs/DiagnosticStatus."""
 
     NOTE = 0
     WARNING = 1

@@ -47,7 +47,7 @@ class _Stop:
 
 
 def stopping_once() -> _Stop:
-    """Return a handler of signals, which is that of Ctrl-C from now on.
+    """Return a handler of signals, which handles Ctrl-C from now on.
 
     Who ignores Ctrl-C, as a job in the background does, goes on doing so.
     """

@@ -83,7 +83,7 @@ class Estimate:
 
     @property
     def is_localised(self) -> bool:
-        """Whether the estimate is in its final frame, that of a map if one was loaded."""
+        """Whether the estimate is in its final frame: a map's, if one was loaded."""
         return self._localiser.is_localised
 
     @property

@@ -1,6 +1,6 @@
 """How all figures are drawn: without pyplot, so that nobody's settings change.
 
-Colours are those of Okabe and Ito, which colour-blind readers can distinguish.
+The colours are by Okabe and Ito: colour-blind readers can distinguish them.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def is_flat(points: FloatArray) -> bool:
 def legend_below(figure: Figure, named: Axes, columns: int) -> None:
     """Write what is drawn in axes below all axes of a figure, which make room for it.
 
-    Not ``loc='outside lower center'``: matplotlib 3.6, that of Ubuntu 24.04, doesn't know it.
+    Not ``loc='outside lower center'``: matplotlib 3.6 of Ubuntu 24.04 doesn't know it.
     """
     legend = figure.legend(
         *named.get_legend_handles_labels(), loc='lower center', ncols=columns, borderaxespad=0.0

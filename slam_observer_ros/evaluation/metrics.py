@@ -1,6 +1,6 @@
 """Accuracy of an estimated trajectory and map against the truth.
 
-The configuration error belongs to the paper's quotient: that of the map as the robot sees it.
+The configuration error belongs to the paper's quotient: the map as the robot sees it.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class TrajectoryErrors:
         return self.truth.moved(se3.inverse(self.alignment))
 
     def in_estimate(self, points: FloatArray) -> FloatArray:
-        """Return points (n, 3) of the truth's world in that of the estimate, metres."""
+        """Return points (n, 3) of the truth's world in the estimate's world, metres."""
         return se3.transform(se3.inverse(self.alignment), points)
 
     @property
@@ -281,7 +281,7 @@ class ConfigurationError:
 
 
 def _nees(errors: FloatArray, P: FloatArray) -> float:
-    """Return eᵀ P⁻¹ e per degree of freedom of errors (m, 3), P (m k, m k) that of k of them."""
+    """Return eᵀ P⁻¹ e per degree of freedom of errors (m, 3); P (m k, m k) has k of them."""
     e = errors[:, : len(P) // len(errors)].ravel()
     regular = P + ROUNDING * np.trace(P) * np.eye(len(P))
     return float(e @ np.linalg.solve(regular, e)) / len(e)

@@ -1,4 +1,4 @@
-"""The coordinates that a filter estimates: all of 3D, or those of planar motion."""
+"""The coordinates that a filter estimates: all of 3D, or planar motion."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
 def loses_digits(variances: FloatArray, W: FloatArray, L: FloatArray) -> bool:
     """Return whether P − Wᵀ W has lost the digits that the rest of it is made of.
 
-    ``variances`` (N,) are those of P, W (M, N) is L⁻¹ H P, and L (M, M) the factor of S. P − Wᵀ W
+    ``variances`` (N,) are P's, W (M, N) is L⁻¹ H P, and L (M, M) the factor of S. P − Wᵀ W
     leaves less than LOST of a variance, or a pivot of S less than LOST of the entry it began with.
     """
     left = variances - np.einsum('ij,ij->j', W, W)

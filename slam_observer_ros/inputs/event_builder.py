@@ -51,7 +51,7 @@ class EventBuilder:
     """Makes events in the base frame of measurements, in the order in which these come.
 
     What needs a transform that is not known yet waits for it. After the timeout velocities are
-    taken to be those of the base until their transform is known, fiducials that /tf never had are
+    taken as they are until their transform is known, fiducials that /tf never had are
     directions, where their camera is known, and all else is dropped:
     ``on_drop`` is called with the reason, and :func:`drop_reason` gives the key to count it by.
     Poses further apart than the velocity's timeout give no velocity.

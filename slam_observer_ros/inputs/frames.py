@@ -264,13 +264,13 @@ class BaseFrame:
         return self._moved(event, frame_id)
 
     def velocity(self, event: VelocityEvent) -> VelocityEvent:
-        """Return the velocity of the base, given that of a frame that moves with the robot."""
+        """Return the velocity of the base, given the velocity of a frame on the robot."""
         if event.sensor_frame.lstrip('/') in self._world_frames:
             raise TransformError(f"'{event.sensor_frame}' does not move with the robot")
         return self._moved(event, event.sensor_frame)
 
     def is_base(self, frame_id: str) -> bool:
-        """Return whether velocities in a frame are those of the base as they are."""
+        """Return whether velocities in a frame are the base's as they are."""
         plain = frame_id.lstrip('/')
         return plain in ('', self.name) and plain not in self._world_frames
 

@@ -43,7 +43,7 @@ class PoseDifferences:
     leads exactly there. It is known one period late, which the reorder window must cover. Poses
     further apart than ``timeout_ns`` give none.
 
-    A pose whose stamp is not clearly later than that of the one before, as of a coarse clock or in
+    A pose whose stamp is not clearly later than the one before, as of a coarse clock or in
     a burst that is stamped as it arrives, is skipped: the next velocity leads on from the last one
     that was used, so that no motion is lost and no speed is made up.
     """
@@ -101,7 +101,7 @@ class PoseDifferences:
         self._stamps_ns.append(stamp_ns)
 
     def _refuse_stamp(self, stamp_ns: int, duration_ns: int) -> None:
-        """Refuse a stamp that is not clearly later than that of the last pose used."""
+        """Refuse a stamp that is not clearly later than the stamp of the last pose used."""
         stamps_ns = self._stamps_ns
         if stamp_ns > stamps_ns[-1] + PAUSE_NS:
             stamps_ns.clear()
@@ -144,7 +144,7 @@ class OdometryCheck:
     Parameters
     ----------
     uses_turn : bool
-        Whether turns are compared, too: not where those of an Imu take their place.
+        Whether turns are compared, too: not where an Imu's take their place.
 
     Attributes
     ----------

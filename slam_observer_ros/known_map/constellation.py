@@ -4,7 +4,7 @@ A *base* of the points, two in the plane and three in space, has the distances o
 the map. Each such set of landmarks says where all points are in the map, and there the others are
 looked for. Where q of m points are landmarks, there is a base of such points among any m − q + k
 of them (k = 2 or 3): so bases of these few find every place with q matches or more, and q is
-lowered until no place with fewer could matter. The method is that of D. Ronzoni, R. Olmi,
+lowered until no place with fewer could matter. The method is by D. Ronzoni, R. Olmi,
 C. Secchi and C. Fantuzzi, *AGV global localization using indistinguishable artificial landmarks*
 (ICRA 2011); how likely a place is, is not in it: :mod:`.places`.
 """
@@ -249,7 +249,7 @@ class _Gates:
     def _radii_m(
         base: IntArray, rest: IntArray, known: MappedLandmarks, seen: Constellation
     ) -> FloatArray:
-        """Return the radii (m − k,): of a point's own error, and what that of the base adds."""
+        """Return the radii (m − k,): of a point's own error, and what the base's error adds."""
         axes, m, k = known.axes, len(seen), known.axes.point
         J = axes.output_matrix(seen.points)
         moved = -J[rest] @ np.linalg.pinv(J[base].reshape(-1, axes.p))  # (m − k, k, k k)
@@ -288,5 +288,5 @@ def _is_hit(is_near: BoolArray, near: IntArray, only: IntArray, taken: IntArray)
 
 
 def _is_part_of(rows: IntArray, other: IntArray) -> bool:
-    """Return whether all matches (m,) of a place are those of another one."""
+    """Return whether another place has all the matches (m,) of a place."""
     return bool(((rows == other) | (rows < 0)).all())

@@ -86,7 +86,7 @@ class LandmarkMap:
 
     @property
     def is_planar(self) -> bool:
-        """Whether all heights are zero and exact, as those of a map made with ``two_d_mode``."""
+        """Whether all heights are zero and exact, as in a map made with ``two_d_mode``."""
         if self.covariances is None or not len(self.ids):
             return False
         return not (self.world_points[:, 2].any() or self.covariances[:, 2].any())
@@ -96,7 +96,7 @@ class LandmarkMap:
         return replace(self, world_points=self.world_points * np.array([1.0, 1.0, 0.0]))
 
     def covariances_or(self, sigma_m: float) -> FloatArray:
-        """Return (n, 3, 3) covariances, those of ``sigma_m`` in each coordinate if unknown.
+        """Return (n, 3, 3) covariances; unknown ones have ``sigma_m`` in each coordinate.
 
         Standard deviations beyond MAX_DEVIATION say no more than that, and are cut to it.
         """

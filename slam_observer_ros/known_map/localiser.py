@@ -106,7 +106,7 @@ class Localiser:
     ) -> None:
         """Take a state at its start, in a loaded map if its pose there is given.
 
-        ``covariance`` (6, 6) is that of the given pose; None for an exact one. ``known`` is the
+        ``covariance`` (6, 6) belongs to the given pose; None for an exact one. ``known`` is the
         map that it is in, if there are several.
         """
         self._search_again()

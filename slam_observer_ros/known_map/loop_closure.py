@@ -157,7 +157,7 @@ class LoopClosure:
         self._doubled |= doubled
 
     def _twins(self, state: State, own: IntArray) -> tuple[IntArray, IntArray] | None:
-        """Return the row of a landmark and that of one which it certainly is, (1,) each."""
+        """Return the rows of a landmark and of one which it certainly is, (1,) each."""
         from scipy.spatial import cKDTree  # which only points without ids need
 
         landmarks, k = state.landmarks, state.axes.point

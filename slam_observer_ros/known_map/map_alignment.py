@@ -102,7 +102,7 @@ def _aligned(source: FloatArray, own: FloatArray, target: KnownLandmarks) -> Flo
 def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:
     """Return the standard deviation of the robot's attitude in a map, about the worst axis.
 
-    Parameters are those of :func:`slam_observer_ros.observer.known_landmarks.anchor`.
+    Parameters are as for :func:`slam_observer_ros.observer.known_landmarks.anchor`.
     """
     turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
     try:
@@ -130,7 +130,7 @@ def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likeness:
-    """A motion after which landmarks of a map are nearly where those of a map are."""
+    """A motion after which landmarks are nearly where a map has them."""
 
     transform: FloatArray  # (4, 4)
     is_same: BoolArray  # (n,) which landmarks are then where others are

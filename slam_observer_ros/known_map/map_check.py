@@ -139,7 +139,7 @@ def look_around(
     """Look around from places all over a map, by a sensor that sees ``view_m`` far.
 
     ``fov_rad`` is its field of view, and ``sigma_m`` the noise of each coordinate; ``map_sigma_m``
-    that of landmarks whose file gives none.
+    is for landmarks whose file gives none.
     """
     covariances = known.covariances_or(map_sigma_m)
     mapped = MappedLandmarks(known.world_points, covariances, axes)

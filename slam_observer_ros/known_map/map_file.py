@@ -209,7 +209,7 @@ def read_maps(path: Path) -> list[LandmarkMap]:
 
 
 def map_files(path: Path) -> list[Path]:
-    """Return the file of a map, or those of a folder, by name; MapError if there are none."""
+    """Return the file of a map, or a folder's files, by name; MapError if there are none."""
     try:
         if not path.is_dir():
             return [path]

@@ -238,7 +238,7 @@ def _in_axes(R: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _tagslam_pose(written: Mapping[str, Any] | None) -> FloatArray:
-    """Return a pose (4, 4) of position and rotation vector; none is that of the frame itself."""
+    """Return a pose (4, 4) of position and rotation vector; None is the frame itself."""
     if written is None:
         return np.eye(4)
     position, rotation = (_axes(written[name], name) for name in ('position', 'rotation'))

@@ -37,7 +37,7 @@ RANK_TOLERANCE = 1e-8
 def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
     """Add a map to a state at its start, whose pose is given in the map's frame.
 
-    ``pose_covariance`` (6, 6) is that of rotation vector and position along the map's axes, rad²
+    ``pose_covariance`` (6, 6) has rotation vector and position along the map's axes, rad²
     and m²; None for an exact pose.
     """
     state.set_pose(state.observer.pose, pose_covariance)

@@ -3,9 +3,9 @@
 Each point is one of the landmarks in view with the probability 1 − f, else it is anywhere in view.
 How many points are of no landmark is not known beforehand: f has a beta distribution. The *mass*
 of a place is the likelihood of all points, integrated over where exactly it is; its *share* is its
-part of all masses, that of 'none of them' among these. Where the points lie by chance, the mean of
-the likelihoods of all places together is that of 'none of them' (in halls with 2000 reflectors it
-is a twentieth): so chance seldom gives a place a large share.
+part of all masses, 'none of them' among these. Where the points lie by chance, the mean of
+the likelihoods of all places together equals 'none of them' (in halls with 2000 reflectors it is
+a twentieth): so chance seldom gives a place a large share.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class PlacePrior(Protocol):
     def log_density(self, transform: FloatArray, covariance: FloatArray) -> float:
         """Return ln of the density, over rad and m, at a transform (4, 4) that is uncertain.
 
-        ``covariance`` (p, p) is that of its turn and position on the axes that are estimated.
+        ``covariance`` (p, p) has its turn and position on the axes that are estimated.
         """
 
     @property

@@ -99,7 +99,7 @@ def decode_detections(reader: CdrReader) -> ObservationEvent:
     The id of a landmark is the number that ends its detection's ``id``, or else its first
     result's ``class_id``: both are strings. No id are UUIDs, hashes, and numbers beyond
     ``MAX_ID``, as trackers give them. Its pose, with covariance if it is known of all, is that
-    result's, or else, if that is missing or zero, that of the centre of the box.
+    result's, or else, if that is missing or zero, the pose of the box's centre.
     """
     return _read_detections(reader, ('id',))
 
@@ -151,7 +151,7 @@ def observed_tags(
 
 
 def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
-    """Say that none of the frames on /tf is that of a fiducial, and what to do."""
+    """Say that no frame on /tf belongs to a fiducial, and what to do."""
     names = sorted(frames)
     there = ', '.join(names[:MAX_NAMES]) + (', …' if len(names) > MAX_NAMES else '')
     return (

@@ -95,7 +95,7 @@ def observed_poses(
 ) -> ObservationEvent:
     """Return landmarks at ``poses`` (m, 7), position first, seen in one frame.
 
-    Of ``pose_covariances`` (m, 6, 6), zero where unknown, those of the positions are used if they
+    Of ``pose_covariances`` (m, 6, 6), zero where unknown, the positions' are used if they
     are known of all.
     """
     covariances = turns = None

@@ -212,7 +212,7 @@ def decode_twist_with_covariance_stamped(reader: CdrReader) -> VelocityEvent:
 
 @reads('geometry_msgs/msg/Twist', role='velocity')
 def decode_twist(reader: CdrReader) -> VelocityEvent:
-    """Read a geometry_msgs/Twist, whose only time is that of its reception."""
+    """Read a geometry_msgs/Twist, whose only time is when it was received."""
     return VelocityEvent(reader.receive_ns, _read_twist(reader))
 
 

@@ -1,6 +1,6 @@
 """A node that nothing ends which comes in: what a callback raises is logged, and it goes on.
 
-And what else nodes log: lines that would be repeated, and those of the layers without ROS.
+And what else nodes log: lines that would be repeated, and lines of the layers without ROS.
 """
 
 from __future__ import annotations

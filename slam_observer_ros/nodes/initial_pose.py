@@ -139,7 +139,7 @@ class InitialPoseListener:
 def filled_in(covariance: FloatArray | None) -> FloatArray:
     """Return a covariance (6, 6) with variances assumed where the message gives none.
 
-    RViz's 2D Pose Estimate, for one, gives those of x, y and yaw only, and zeros else. Those
+    RViz's 2D Pose Estimate, for one, gives only x, y and yaw, and zeros else. Variances
     that are so large that they only say 'unknown' are made less, lest they drown all others.
     Raises a MessageError if it is not finite, not symmetric, or negative in some direction.
     """

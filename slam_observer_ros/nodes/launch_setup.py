@@ -90,7 +90,7 @@ BOND_PERIOD_S = 0.25
 
 
 def parameters(given: Mapping[str, str], has_bond: bool) -> dict[str, object]:
-    """Return the parameters beside those of params_file.
+    """Return the parameters that params_file has not.
 
     Beside a map server the lifecycle manager activates the node, with a bond if it can have one.
     """

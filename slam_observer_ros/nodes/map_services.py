@@ -40,7 +40,7 @@ class MapServices:
     Raises
     ------
     MapError
-        If the map of the start can't be read, or that of the end could not be written.
+        If the map of the start can't be read, or the map of the end could not be written.
     ParameterError
         If the map is to be saved at the end, but not where.
 
@@ -93,7 +93,7 @@ class MapServices:
                 raise MapError(f'the map is not saved: {error}') from error
 
     def save_to(self, path: str, response: Trigger.Response) -> Trigger.Response:
-        """Save the map to a file, that of ``map_path`` if none is named; return the response."""
+        """Save the map to a file, ``map_path`` if none is named; return the response."""
         return self._answer(response, self._save, path)
 
     def load_from(self, path: str, response: Trigger.Response) -> Trigger.Response:

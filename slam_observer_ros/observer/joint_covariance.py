@@ -45,7 +45,7 @@ class JointCovariance:
     def __init__(
         self, chart: Chart, matrix: SymmetricMatrix, start: FloatArray, unknown: FloatArray
     ) -> None:
-        """Begin with ``start``, that of pose and calibration (p + c, p + c).
+        """Begin with ``start`` (p + c, p + c) of pose and calibration.
 
         ``unknown`` (stride − k,) are the variances of all else of a landmark seen for the first
         time.

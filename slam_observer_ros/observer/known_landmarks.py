@@ -95,7 +95,7 @@ def tags_among(orientations: FloatArray | None) -> IntArray:
 def part_of_joint(
     joint: FloatArray, n: int, tags: IntArray, rows: IntArray | BoolArray
 ) -> FloatArray:
-    """Return the part of a joint covariance of n landmarks that is that of ``rows``."""
+    """Return the part of a joint covariance of n landmarks that ``rows`` have."""
     chosen = np.arange(n)[rows]
     number_of = np.full(n, -1)
     number_of[tags] = n + np.arange(len(tags))

@@ -89,7 +89,7 @@ class Contents:
         return missing_ids(self._field_names(topic), topic.message_type)
 
     def missing_tags(self, selected: SelectedTopics, tag_frame_prefix: str) -> str:
-        """Return why no frame on /tf is that of a fiducial; empty if one is, or none is wanted."""
+        """Return why no frame on /tf is a fiducial's; empty if one is, or none is wanted."""
         topics: dict[str, Sequence[Topic]] = {
             TRANSFORMS: (selected.landmarks,),
             APRILTAGS: selected.transforms.moving,
@@ -114,7 +114,7 @@ class Contents:
         return any(not np.array_equal(pose, after) for pose, after in pairwise(poses))
 
     def twist_problem(self, topic: Topic, uses_turn: bool) -> str:
-        """Return what an odometry's twist is, if it is not that of its poses; else empty."""
+        """Return what an odometry's twist is, if it is not how its poses move; else empty."""
         check = OdometryCheck(uses_turn)
         if topic.message_type == ODOMETRY:
             decoded = self._decoded((topic,), lambda raw: decode_odometry(raw.data))
@@ -234,7 +234,7 @@ class Arrivals:
         return -float(np.median(self._delays_s)) if self._delays_s else 0.0
 
     def behind_s(self, other: Arrivals) -> float:
-        """Return how far the stamps are behind those of another topic, seconds.
+        """Return how far the stamps are behind another topic's, seconds.
 
         That is the median, each compared with the other topic's at its time: a simulated clock
         that is slower than the recorder's is no offset. It is zero if they have no time in common.

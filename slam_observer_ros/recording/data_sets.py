@@ -187,7 +187,7 @@ def load_plaza(folder: Path | str, run: int) -> DataSet:
     The folder has ``plazaN_dr.csv``, the way t, forward m, turn rad since the row before;
     ``…_gt.csv``, the true t, x, y, yaw; ``…_td.csv``, t, sender, anchor, range m; ``…_tl.csv``,
     anchor, x, y: t in seconds, each below a line of names. Raises a DataSetError if one is missing
-    or malformed; those of the truth may be missing.
+    or malformed; the truth's may be missing.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""Messages of an MCAP file in the order in which they were received, those of one topic in blocks.
+"""Messages of an MCAP file in the order in which they were received, one topic's in blocks.
 
 The library's readers give them one by one, and none of a damaged file's end.
 """
@@ -64,7 +64,7 @@ class _Messages(NamedTuple):
 class McapSource(MessageSource):
     """An MCAP file; of a damaged one, the whole records before and behind the damage.
 
-    ``other_encodings`` are those of the channels that are left out, as they are not CDR, and how
+    ``other_encodings`` are what channels are left out for, as they are not CDR, and how
     many these are.
     """
 
@@ -101,7 +101,7 @@ class McapSource(MessageSource):
     def blocks(
         self, topics: Collection[Topic], together: Topic
     ) -> Iterator[RawMessage | RawBlock]:
-        """Yield the same, those of one of the topics in blocks."""
+        """Yield the same, the messages of one of the topics in blocks."""
         ordered = list(topics)
         for messages in self._in_order(ordered):
             yield from _in_runs(messages, ordered, together)

@@ -150,7 +150,7 @@ class Recording:
     def find_topics(
         self, names: TopicNames = TopicNames(), inputs: InputSettings = InputSettings()
     ) -> SelectedTopics:
-        """Pick the topics of velocities, landmarks and truth, and that of an Imu if it is used.
+        """Pick the topics of velocities, landmarks and truth, and an Imu's if it is used.
 
         What the user doesn't name is found by message type and name; see :func:`select_topics`.
         """
@@ -184,7 +184,7 @@ class Recording:
 
         Where velocities follow each other they come in blocks, which are cheaper to handle.
         They come in the order in which they were received; what waits for a transform on /tf
-        comes when that has been received, or is dropped after the timeout. Stamps are those of
+        comes when that has been received, or is dropped after the timeout. Stamps are in
         the messages' headers; an unstamped Twist has its receive time, and so has what leaves its
         stamp zero, which is counted in :attr:`unstamped`. Malformed messages are left out and
         counted in :attr:`malformed`, what was dropped in :attr:`dropped`; the first is logged.

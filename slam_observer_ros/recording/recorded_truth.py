@@ -129,7 +129,7 @@ def _positions_by_stamp(
 
 
 def other_frames(base_frame: str, poses: Iterable[PoseBlock]) -> set[str]:
-    """Return the frames of poses that say whose they are, and are not those of the base."""
+    """Return the frames of poses that say whose they are, and are not the base's."""
     known = ('', base_frame.lstrip('/'))
     frames = {block.child_frame_id for block in poses}
     return {frame for frame in frames if base_frame and frame.lstrip('/') not in known}

@@ -166,7 +166,7 @@ class MessageSource(ABC):
     def blocks(
         self, topics: Collection[Topic], together: Topic
     ) -> Iterator[RawMessage | RawBlock]:
-        """Yield the same, those of one of the topics in blocks."""
+        """Yield the same, the messages of one of the topics in blocks."""
         return in_blocks(self.messages(topics), together)
 
     def close(self) -> None:  # noqa: B027 (most are open only while they are read)
@@ -214,7 +214,7 @@ class SplitSource(MessageSource):
 
 
 def in_blocks(messages: Iterator[RawMessage], together: Topic) -> Iterator[RawMessage | RawBlock]:
-    """Yield messages, those of one topic and size that follow each other in blocks."""
+    """Yield messages; ones of one topic and size that follow each other come in blocks."""
 
     def key(raw: RawMessage) -> int:
         return len(raw.data) if raw.topic == together else -1

@@ -43,7 +43,7 @@ class TopicNames:
 
 @dataclass(frozen=True, slots=True)
 class TransformTopics:
-    """/tf_static and /tf, or those of a namespace: each one topic, or none."""
+    """/tf_static and /tf, or a namespace's: each one topic, or none."""
 
     static: tuple[Topic, ...]
     moving: tuple[Topic, ...]
@@ -111,7 +111,7 @@ def select_topics(
         Whether the points of a cloud have ids. Clouds without them, such as a lidar's, are taken
         only if they are chosen by name or by their type, or are called ``landmarks``.
     pose_frame : callable
-        The frame of an odometry's poses. Where it is that of the map, the velocity is an estimate,
+        The frame of an odometry's poses. Where it is the map's, the velocity is an estimate,
         as an observer's own, and taken only if there is no other.
 
     """
@@ -150,7 +150,7 @@ def pose_topic(topics: Sequence[Topic], name: str | None) -> Topic:
 
 @dataclass(frozen=True, slots=True)
 class _Choice:
-    """The topics of a recording, those of them that have messages, and what to choose them by."""
+    """The topics of a recording, which have messages, and what to choose them by."""
 
     topics: Sequence[Topic]
     used: Sequence[Topic]
@@ -189,7 +189,7 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
 
     Robots in namespaces may each have their own, with the same names of frames. Those of the
     namespace that the inputs share come first, then those further out, /tf at last. Where none
-    of these is recorded, those of another namespace are taken if there is only one.
+    of these is recorded, another namespace's are taken if there is only one.
     """
     trees = [
         topic

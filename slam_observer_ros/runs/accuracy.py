@@ -49,7 +49,7 @@ STILL = 1e-12
 class Accuracy:
     """Errors of a replay; None where the truth that it takes is not in the recording.
 
-    Poses, those of the velocities alone and the map are each compared after one rigid alignment of
+    Poses, dead reckoning and the map are each compared after one rigid alignment of
     their own; the configuration (:class:`.ConfigurationError`) takes none. ``anees`` of the pose
     is also None where the gains know no covariance, and where no pose is certain to which the
     truth could be moved: in a known map, or if the truth begins too late. ``configuration_anees``
@@ -117,7 +117,7 @@ def smoothed_trajectory(
     dead_reckoning: Trajectory,
     estimator: Estimate,
 ) -> Trajectory:
-    """Return the smoothed poses at any stamps (m,), such as those of the online trajectory.
+    """Return the smoothed poses at any stamps (m,), such as the online trajectory's.
 
     Between observations, and beyond the first and last one, the robot moved as the velocities
     have it by the calibration of an ``estimator``.
@@ -238,7 +238,7 @@ class Likelihood:
 
 
 class LikelihoodRecorder:
-    """Notes the likelihood of each observation of a run; ``dimension`` is that of a point."""
+    """Notes the likelihood of each observation of a run; a point has the ``dimension``."""
 
     def __init__(self, dimension: int, reach_m: float) -> None:
         ball = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1) * reach_m**dimension

@@ -85,7 +85,7 @@ class Correction:
     def points_seen_along(self, axis: FloatArray | None) -> FloatArray:
         """Return by what lines of sight (3,) are multiplied that a sensor has which looks there.
 
-        Such a sensor is turned about z against the robot, whose axes those of the event are.
+        Such a sensor is turned about z against the robot, whose axes the event has.
         """
         if axis is None or not axis[:2].any():
             return self.points

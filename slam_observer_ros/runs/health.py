@@ -250,7 +250,7 @@ def of_noise(factors: Iterable[MotionFactor]) -> list[Finding]:
 def of_fit(factor: float | None) -> list[Finding]:
     """Judge how many times as large as stated innovations are; None if that is not known.
 
-    Next to nothing is that of sensors without any noise, as a simulation's may be.
+    Next to nothing have sensors without any noise, as a simulation's may be.
     """
     if factor is None or factor < NOISELESS:
         return []
@@ -299,7 +299,7 @@ def of_stamps(unstamped: Counter[str]) -> list[Finding]:
 
 
 def of_map(counts: Counter[str], *, is_start_given: bool) -> Iterator[Finding]:
-    """Judge whether a map that does not grow is that of the place."""
+    """Judge whether a map that does not grow is the place's."""
     share = point_share(counts, 'unmapped_landmark')
     if share > MAX_UNMAPPED:
         start = ', and did the robot start where it was said to' if is_start_given else ''

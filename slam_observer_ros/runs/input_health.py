@@ -112,7 +112,7 @@ def of_recording(
 
 
 def _of_poses(recording: Recording, selected: SelectedTopics, result: Replay) -> Iterator[Finding]:
-    """Say where the motion is, if an odometry's velocities are not those of its poses."""
+    """Say where the motion is, if an odometry's velocities are not how its poses move."""
     poses, velocity = result.dead_reckoning.poses, selected.velocity
     stands_still = len(poses) > 1 and bool((poses == poses[0]).all())
     if stands_still and recording.contents.poses_move(velocity):
@@ -163,7 +163,7 @@ def _of_end(topic: str, arrivals: Arrivals, start_s: float, end_s: float) -> Ite
 
 
 def _of_clocks(inputs: Mapping[str, Arrivals]) -> Iterator[Finding]:
-    """Say which inputs have stamps of the future, or far from those of the velocity."""
+    """Say which inputs have stamps of the future, or far from the velocity's."""
     (first_name, first), *others = inputs.items()
     if first.ahead_s > MAX_AHEAD_S:
         yield found('early_stamps', topic=first_name, ahead_s=first.ahead_s)

@@ -66,7 +66,7 @@ def replay(
 
     The events are in the order in which they were received; the truth is what the configuration
     error is measured against. Where not all is kept, memory does not grow with the recording:
-    there are no poses, of those of the velocities alone the first and the last, and no residuals.
+    there are no poses, of dead reckoning the first and the last, and no residuals.
     What ``recorders`` note is shown or written.
     """
     run = _RunningReplay(settings, truth, landmark_map, keep_all, recorders)

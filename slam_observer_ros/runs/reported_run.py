@@ -240,8 +240,8 @@ def _use(weight: float) -> str:
 class ReportedRun:
     """A replay with what was recorded of it, from ``start_ns`` on.
 
-    ``trajectory`` is the online one and ``errors`` its errors; ``dead_reckoning`` is that of the
-    velocities alone; ``anees`` is that of the pose. Both are None where there is no truth.
+    ``trajectory`` is the online one and ``errors`` its errors; ``dead_reckoning`` follows the
+    velocities alone; ``anees`` is the pose's. Both are None where there is no truth.
     ``smoothed`` is None unless smoothing was asked for, ``smoothed_errors`` without truth, too.
     """
 

@@ -201,7 +201,7 @@ def stated_motion_covariances(
 def _white_s(before_s: FloatArray, dt_s: FloatArray, usual_s: FloatArray) -> FloatArray:
     """Return variances over their density: (k, 6), or ``dt_s`` (k, 1) if one for all axes.
 
-    The density is that of errors which are new in each message. Held for t, longer than the
+    The density belongs to errors which are new in each message. Held for t, longer than the
     usual T, one of them has moved the robot by t/T times as much: t²/T, not t. Slip is as before.
     """
     until_s = before_s + dt_s

@@ -1,1 +1,1 @@
-"""Every parameter: the table, the file, and those of estimator, inputs and nodes."""
+"""Every parameter of estimator, inputs and nodes, their table and their file."""

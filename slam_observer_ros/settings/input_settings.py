@@ -31,7 +31,7 @@ class MessageType:
     package : str
         What publishes it, as documents name that; empty for many.
     definition : str
-        Its fields, those of nested types behind them as in recordings; empty for those of ROS's
+        Its fields, nested types behind them as in recordings; empty for types of ROS's
         common interfaces. Recordings that define it otherwise are refused.
     is_ambiguous : bool
         Whether it may hold other things, too: it is only taken where the user names type or topic.

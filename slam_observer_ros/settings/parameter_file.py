@@ -50,7 +50,7 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     The file has the usual form ``<node or /**>: ros__parameters: {name: value}``, the node maybe
     below its namespaces; nested mappings become dotted names. Sections of other nodes are left
     out. In the names of sections ``*`` stands for one name, and ``**`` for any number of them.
-    What is not readable, not YAML, has a key twice, no parameters for this package, or those of
+    What is not readable, not YAML, has a key twice, no parameters for this package, or some for
     several robots, is a ParameterError.
     """
     sections = [(name, body) for name, body in _read_sections(path) if _fits(name, _node_of(name))]

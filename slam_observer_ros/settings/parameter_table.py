@@ -173,7 +173,7 @@ def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object
 
 
 def checked(settings: SettingsT) -> SettingsT:
-    """Return settings that were built in Python, with their values checked as those of a file are.
+    """Return settings that were built in Python, with their values checked as a file's are.
 
     What does not fit the table, or is no settings, is a ParameterError.
     """

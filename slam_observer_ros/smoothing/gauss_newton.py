@@ -288,7 +288,7 @@ def _contiguous(part: object) -> object:
 
 
 def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:
-    """Return the information (S, d, d) of motions, or (S, d + c, d + c) with that of a drift."""
+    """Return the information (S, d, d) of motions, or (S, d + c, d + c) with a drift's."""
     of_motions = inverse(keyframes.links.covariances)
     if not drifts:
         return of_motions

@@ -439,7 +439,7 @@ class Relinearisation(Past):
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:
-    """Return the covariance of Ad_A ε and all else, given that of ε and all else."""
+    """Return the covariance of Ad_A ε and all else, given the one of ε and all else."""
     p = axes.p
     Ad = se3.adjoint(A)[axes.pose, axes.pose]
     changed: FloatArray = P.copy()

@@ -26,7 +26,7 @@ MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
 
 
 def of_landmarks(observer: Observer, covariances: FloatArray) -> FloatArray:
-    """Return covariances of landmarks along the world's axes, given those of ã_i (n, 3, 3)."""
+    """Return covariances of landmarks along the world's axes, given ã_i's (n, 3, 3)."""
     R = observer.reference_pose[:3, :3]
     world: FloatArray = R @ covariances @ R.T
     return world
@@ -35,7 +35,7 @@ def of_landmarks(observer: Observer, covariances: FloatArray) -> FloatArray:
 def of_configuration(
     observer: Observer, axes: EstimatedAxes, rows: IntArray, P: FloatArray
 ) -> FloatArray:
-    """Return that of landmarks (m k, m k) as seen from the robot; ``P`` is of ε and ã_i."""
+    """Return the covariance (m k, m k) of landmarks seen from the robot; ``P`` is of ε and ã_i."""
     # Along the axes of the body: the choice of the world's frame has no part in it.
     m, k, p = len(rows), axes.point, axes.p
     C = axes.output_matrix(observer.points[rows]).reshape(-1, p)
@@ -49,7 +49,7 @@ def of_configuration(
 
 
 def of_pose(observer: Observer, covariance: FloatArray, A: FloatArray) -> FloatArray:
-    """Return the pose's covariance (…, 6, 6) at Â = ``A`` (…, 4, 4), given that of ε (…, 6, 6).
+    """Return the pose's covariance (…, 6, 6) at Â = ``A`` (…, 4, 4), given ε's (…, 6, 6).
 
     Of its rotation vector and its position along the world's axes, rad² and m².
     """
@@ -69,7 +69,7 @@ def of_moved_pose(
 ) -> FloatArray:
     """Return the covariance (6, 6) of ``pose`` @ ``motion`` (4, 4), given ``world``, the pose's.
 
-    Both are :func:`of_pose`'s; ``noise`` (6, 6) is that of w in exp(w) ``motion``, along the
+    Both are :func:`of_pose`'s; ``noise`` (6, 6) is w's in exp(w) ``motion``, along the
     pose's axes.
     """
     R = pose[:3, :3]

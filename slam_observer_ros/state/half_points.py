@@ -85,9 +85,9 @@ class HalfPoints:
     def completed(
         self, event: ObservationEvent, state: State, *, is_lost: bool
     ) -> ObservationEvent:
-        """Return an observation whose points are whole; those of which nothing is known wait.
+        """Return an observation whose points are whole; points of which nothing is known wait.
 
-        Of a robot that ``is_lost`` in a map those of its landmarks go to the :attr:`window`.
+        Of a robot that ``is_lost`` in a map the points of its landmarks go to the :attr:`window`.
         """
         if event.kinds is None or not (event.kinds != POINT).any():
             return event

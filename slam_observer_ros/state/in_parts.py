@@ -1,6 +1,6 @@
 """Observations that the usual step uses: nearly always whole, else in parts.
 
-Points that are rejected are counted afterwards, over the same arrays, and those of new landmarks
+Points that are rejected are counted afterwards, over the same arrays, and points of new landmarks
 entered, as :mod:`.step` does it.
 """
 

@@ -154,7 +154,7 @@ def reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray)
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
     """Return where points seem to be (m, 3), reference frame, and tolerances (m,), metres.
 
-    By their own noise: that of where a landmark should be may be much less.
+    By their own noise: a landmark's own uncertainty may be much less.
     """
     spread_m = np.sqrt(np.trace(state.observation_noise.covariances(event), axis1=1, axis2=2))
     return se3.transform(state.observer.A, event.points), SAME_POSITION * spread_m

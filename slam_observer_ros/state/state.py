@@ -182,7 +182,7 @@ class State:
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot to ``pose`` (4, 4), body to world, uncorrelated with the map from now on.
 
-        ``covariance`` (6, 6) is that of :meth:`pose_after`; None for an exact pose.
+        ``covariance`` (6, 6) is as of :meth:`pose_after`; None for an exact pose.
         """
         observer = self.observer
         if not len(self.landmarks):
@@ -247,7 +247,7 @@ class State:
     def keep(self, keyframe: Keyframe, in_doubt: bool = False) -> None:
         """Keep an observation to be linearised again, but none more of a robot that is parked.
 
-        They would say nothing more, and take the place of those of the drive.
+        They would say nothing more, and take the place of the drive's observations.
         """
         stands = self.observation_noise.stood_s > 0.0
         if stands and not in_doubt and keyframe.repeated.min(initial=np.inf) > OLD_NEWS:

@@ -155,7 +155,7 @@ class CloudDecoder:
 
 
 class OdometryDecoder:
-    """Decodes velocities of odometries; warns once if these are not those of their poses.
+    """Decodes velocities of odometries; warns once if their poses move otherwise.
 
     Attributes
     ----------

@@ -122,7 +122,7 @@ class EstimatorFeed:
         return self._builder.is_waiting or self._change.is_holding
 
     def add(self, name: str, measured: Measured, receive_ns: int) -> None:
-        """Take what an input measures; without a stamp it has that of its reception."""
+        """Take what an input measures; without a stamp it has the time of its reception."""
         if not (self.is_active and self._is_of_another_run(name, measured, receive_ns)):
             self._use(name, measured, receive_ns)
         if self.is_waiting:

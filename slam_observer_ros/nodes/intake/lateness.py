@@ -118,7 +118,7 @@ MAX_HELD = 10_000
 
 
 class ClockChange:
-    """Holds messages of the next run until /clock has jumped, and finds those of the last one.
+    """Holds messages of the next run until /clock has jumped, and finds the last run's.
 
     Topics come in no order. Before the jump what is too late to be used may be of the next run.
     After it what is nearer to the time before is of the last one.

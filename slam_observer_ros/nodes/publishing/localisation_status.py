@@ -150,7 +150,7 @@ class LocalisationStatus:
 def deviations(covariance: FloatArray) -> tuple[float, float]:
     """Return standard deviations of position, in its worst direction, m, and of heading, rad.
 
-    ``covariance`` (6, 6) is that of rotation vector and position along the map's axes; both are
+    ``covariance`` (6, 6) has rotation vector and position along the map's axes; both are
     infinite if it is not finite.
     """
     if not np.isfinite(covariance).all():

@@ -212,7 +212,7 @@ class PoseBroadcaster:
         return self._transforms.newest_ns(settings.odom_frame, settings.base_frame)
 
     def _find_parent(self, newest_ns: int | None) -> None:
-        """Choose whose pose to publish; that of odometry on /tf, however late it comes."""
+        """Choose whose pose to publish: odometry's on /tf, however late it comes."""
         if newest_ns is not None and self._child != self._settings.odom_frame:
             self._choose_child(self._settings.odom_frame, '/tf has')
         searched_s = time.monotonic() - (self._begin_s or 0.0)

@@ -1,7 +1,7 @@
 """The joint covariance of large maps, and that in a map that is taken to be exact.
 
-The second is that of pose and calibration alone. The first is a dense one of few landmarks; others
-follow when needed: P is that of pose, calibration and the landmarks that are *active*: near, or
+The second has pose and calibration alone. The first is a dense one of few landmarks; others
+follow when needed: P has pose, calibration and the landmarks that are *active*: near, or
 seen of late (:mod:`.active_landmarks`). What motions and observations do to it comes to all others
 when these become active. It is exact but for one thing: what the noise of a motion does to the
 error ξ_i of a landmark out of view is judged by a reference position, which is set again when the

@@ -186,7 +186,7 @@ class RiccatiGains(OrientationGains):
         super().remove(rows)
 
     def fix_landmarks(self, known: KnownLandmarks) -> None:
-        """Take all landmarks for exact; P is that of pose and calibration from now on."""
+        """Take all landmarks for exact; P has pose and calibration from now on."""
         super().fix_landmarks(known)
         self.joint = ExactMapCovariance(self.joint, known.covariances)
         self.observer.postponed = None
