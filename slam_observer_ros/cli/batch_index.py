@@ -30,7 +30,7 @@ from slam_observer_ros.settings.parameter_table import table
 
 
 @dataclass(frozen=True, slots=True)
-class Links:
+class FileLinks:
     """A cell that leads to files beside the page, by what they are called."""
 
     files: Sequence[tuple[str, str]]
@@ -51,7 +51,7 @@ class Range:
     largest: float
 
 
-Cell = int | float | str | Links | Folded | Range | None
+Cell = int | float | str | FileLinks | Folded | Range | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def _table(table: IndexTable) -> str:
 def _cell(value: Cell) -> str:
     if value is None:
         return '<td class="number"></td>'
-    if isinstance(value, Links):
+    if isinstance(value, FileLinks):
         links = (f'<a href="{escape(href)}">{escape(text)}</a>' for text, href in value.files)
         return f'<td class="links">{" ".join(links)}</td>'
     if isinstance(value, Folded):
@@ -240,7 +240,7 @@ def _runs_table(
         rows.append(
             [
                 run['recording'].removeprefix(folder),
-                Links(
+                FileLinks(
                     [(kind, quote(run[kind], errors='replace')) for kind in FILES if run.get(kind)]
                 ),
                 *(_text(run, name) for name in names),

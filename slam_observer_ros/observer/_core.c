@@ -118,12 +118,12 @@ typedef struct {
     const double *drift;
     long n, room, c, c_v;
     int p, k, pose, turns; /* pose: which of the six axes of a twist comes first */
-} Estimate;
+} FilterState;
 
-static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
+static int read_estimate(Door *door, PyObject *tuple, FilterState *x) {
     static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "i", "b", "d67",
                                         "xv", "dcc", NULL};
-    if (!read_fields(door, tuple, specs, x, "Estimate"))
+    if (!read_fields(door, tuple, specs, x, "FilterState"))
         return 0;
     x->p = x->is_planar ? 3 : 6;
     x->k = x->is_planar ? 2 : 3;
@@ -136,7 +136,7 @@ static int read_estimate(Door *door, PyObject *tuple, Estimate *x) {
         || x->first < x->p + x->c || x->first > x->room || x->stride < x->k
         || x->stride > MAX_ROOM || x->N != x->first + x->stride * x->n
         || x->N > x->room || !are_within(x->estimated, x->c_v, DELAY))
-        return refuse("Estimate");
+        return refuse("FilterState");
     door->sizes['f'] = (Py_ssize_t)x->first;
     return 1;
 }
@@ -189,7 +189,7 @@ typedef struct {
     long m, c_s;
 } Seen;
 
-static int read_seen(Door *door, PyObject *tuple, const Estimate *x, Seen *seen) {
+static int read_seen(Door *door, PyObject *tuple, const FilterState *x, Seen *seen) {
     static const char *const specs[] = {"i", "xm", "dm3", "~dm3", "~dm33", "~d7", "xs", "i", NULL};
     if (!read_fields(door, tuple, specs, seen, "Seen"))
         return 0;
@@ -229,7 +229,7 @@ typedef struct {
     int judges, says_expected;
 } Observed;
 
-static int read_observed(Door *door, PyObject *tuple, const Estimate *x, Observed *out) {
+static int read_observed(Door *door, PyObject *tuple, const FilterState *x, Observed *out) {
     static const char *const specs[] = {"D44", "Dm3", "Dm3", "Dm", "Dm3", "Dm3",
                                         "Do33", "Dm", "Df", "Dj", "De", NULL};
     if (!read_fields(door, tuple, specs, out, "Observed"))
@@ -278,7 +278,7 @@ static int moves(const double V[6]) {
     return 0;
 }
 
-static void calibrated(const Estimate *x, const double V[6], double out[6]) { /* M V + b */
+static void calibrated(const FilterState *x, const double V[6], double out[6]) { /* M V + b */
     int is_moving = moves(V);
     for (int i = 0; i < 6; i++) {
         const double *row = x->rates + 7 * i;
@@ -417,7 +417,7 @@ static void add_stated(int p, const double Ad[36], const double *before, const d
 }
 
 /* The estimated rows of Ad = [[R, 0], [hat(x) R, R]], (p, 6). */
-static void adjoint_rows(const Estimate *x, const Pose *pose, double Ad[36]) {
+static void adjoint_rows(const FilterState *x, const Pose *pose, double Ad[36]) {
     double K[9], KR[9];
     hat(pose->x, K);
     times(K, pose->R, KR);
@@ -431,7 +431,7 @@ static void adjoint_rows(const Estimate *x, const Pose *pose, double Ad[36]) {
 
 /* Add Ad Q Ad' and how the calibration turns, of what belongs to one pose by the trapezoidal rule:
  * halves of the pieces before and after it, either of which may be missing. */
-static void add_at_pose(const Estimate *x, const double Ad[36], const Piece *before,
+static void add_at_pose(const FilterState *x, const double Ad[36], const Piece *before,
                         const Piece *after, const Advanced *out) {
     int p = x->p;
     double Q[6] = {0.0};
@@ -499,7 +499,7 @@ static int mean_about(i64 stamp_ns, const Velocities *v, const Interval *interva
 }
 
 /* Of a delay, F is what the velocity at its two ends differs by. */
-static void fill_delay(const Estimate *x, const double first[36], const double last[36],
+static void fill_delay(const FilterState *x, const double first[36], const double last[36],
                        const double at_start[6], const double at_end[6], double *F) {
     double before[6], after[6];
     calibrated(x, at_start, before);
@@ -513,7 +513,7 @@ static void fill_delay(const Estimate *x, const double first[36], const double l
 }
 
 /* (27)  A <- A exp(V dt) along the pieces, with noise, F and the rows of Ad at both ends. */
-static void follow_path(const Estimate *x, const Piece *pieces, long k, const Advanced *out,
+static void follow_path(const FilterState *x, const Piece *pieces, long k, const Advanced *out,
                         double first[36], double last[36]) {
     int p = x->p;
     Pose pose = pose_of(x->A);
@@ -551,7 +551,7 @@ static void follow_path(const Estimate *x, const Piece *pieces, long k, const Ad
 
 /* x <- x + J (F c + w): P + J' B + B' J with B = F P_c + (noise + F P_cc F') J / 2.
  * J, of rows like P's, is I for the pose, and turns every landmark. ``work``: 2 p N. */
-static void spread(const Estimate *x, const double *noise, const double *F, double *work) {
+static void spread(const FilterState *x, const double *noise, const double *F, double *work) {
     long N = x->N, room = x->room, first = x->first, c = x->c;
     int p = x->p, turns = x->turns;
     double *J = work, *B = work + p * N, *P = x->P;
@@ -595,7 +595,7 @@ static void spread(const Estimate *x, const double *noise, const double *F, doub
 }
 
 /* Move X along velocities (27), with what that does to P. */
-static int advance(const Estimate *x, const Velocities *v, const Interval *interval,
+static int advance(const FilterState *x, const Velocities *v, const Interval *interval,
                    const MotionFigures *figures, const Advanced *out) {
     if (!is_stamp(interval->start_ns) || !is_stamp(interval->end_ns)
         || !is_stamp(interval->delay_ns) || !is_stamp(interval->reach_ns)
@@ -670,7 +670,7 @@ typedef struct {
 } Residuals;
 
 /* Lay the arrays of residuals out in one piece of memory, or count how many numbers they take. */
-static size_t lay_out(Residuals *res, const Estimate *x, long m, double *memory) {
+static size_t lay_out(Residuals *res, const FilterState *x, long m, double *memory) {
     size_t k = (size_t)x->k, n = (size_t)m, M = n * k, c = (size_t)x->c;
     size_t q = (size_t)x->p + c;
     size_t used = 0;
@@ -755,7 +755,7 @@ static void calibrated_point(const Seen *seen, long i, const double turned[9], i
 }
 
 /* D = R (-hat(l) J(psi), I, l) on k axes, of a point at l from the sensor. */
-static void fill_sensitivity(const Estimate *x, const Seen *seen, const double R_hat[9],
+static void fill_sensitivity(const FilterState *x, const Seen *seen, const double R_hat[9],
                              const double J[9], const double l[3], double *D) {
     double K[9], of_turn[9], columns[7][3], turned[3];
     hat(l, K);
@@ -789,7 +789,7 @@ static double repetition_factor(double dt_s, double error_time_s) {
 }
 
 /* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a landmark is in doubt. */
-static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen *seen,
+static int fill_residuals(const FilterState *x, const Landmarks *table, const Seen *seen,
                           const PointFigures *figures, const Limits *limits, const Observed *out,
                           Residuals *res) {
     Pose pose = pose_of(x->A);
@@ -849,7 +849,7 @@ static int fill_residuals(const Estimate *x, const Landmarks *table, const Seen 
     return 1;
 }
 
-static long column_of(const Estimate *x, const Residuals *res, long entry) {
+static long column_of(const FilterState *x, const Residuals *res, long entry) {
     return x->first + x->k * (long)res->rows[entry / x->k] + entry % x->k;
 }
 
@@ -867,7 +867,7 @@ static void with_noise(const Residuals *res, const double *predicted, const doub
 
 /* predicted = C P C' of r_i = C_i (eps, c) - xi_i, with C in the middle between the landmark and
  * the point seen: turning moves at right angles to it. */
-static void fill_predicted(const Estimate *x, const Observed *out, Residuals *res) {
+static void fill_predicted(const FilterState *x, const Observed *out, Residuals *res) {
     long M = res->M, q = res->q;
     for (long i = 0; i < res->m; i++) {
         double middle[3], *C = res->C + res->k * i * q;
@@ -916,7 +916,7 @@ static void write_judged(const Residuals *res, double *judged) {
 
 /* S = C P C' + R, factored; UNUSUAL where that fails, REJECTS where the weights say which points
  * are rejected. */
-static int judge(const Estimate *x, const Limits *limits, const Observed *out, Residuals *res) {
+static int judge(const FilterState *x, const Limits *limits, const Observed *out, Residuals *res) {
     long M = res->M;
     int k = res->k, status = DONE;
     double gate = limits->gate, block[9];
@@ -991,7 +991,7 @@ static void step_factors(const Factors *factors, const double g[2], const double
 /* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms
  * has it, which may be less than is applied; 0 if it is indefinite. ``work``: M (M + p + 1), and
  * ``at``: 2 M. */
-static int learn(const Estimate *x, const Factors *factors, double gate, const Observed *out,
+static int learn(const FilterState *x, const Factors *factors, double gate, const Observed *out,
                  const Residuals *res, double *work, i64 *at, double logs[2],
                  double information[4]) {
     int p = x->p, k = res->k;
@@ -1091,7 +1091,7 @@ static int fill_weights(double huber, Residuals *res, double *work) {
 
 /* Whether S = L L' has a pivot that is next to nothing of the entry it began with, or P - W' W a
  * variance, but for the postponed ones: then the rest has no digits. */
-static int loses_digits(const Estimate *x, const Residuals *res, const double *L) {
+static int loses_digits(const FilterState *x, const Residuals *res, const double *L) {
     for (long i = 0; i < res->M; i++) {
         const double *row = L + i * res->M;
         double pivot = row[i] * row[i];
@@ -1110,7 +1110,7 @@ static int loses_digits(const Estimate *x, const Residuals *res, const double *L
 
 /* (30), (31)  dx = -K r, K = P H' S^-1, and P - K H P; 0 if S is indefinite, or digits are lost.
  * H takes C at the landmark itself: so no observation says anything of the gauge. */
-static int correct(const Estimate *x, Residuals *res, double *L) {
+static int correct(const FilterState *x, Residuals *res, double *L) {
     long M = res->M, N = x->N, c = res->has_sensor ? x->c : 0;
     const double *P = x->P;
     for (long i = 0; i < M; i++) { /* H P */
@@ -1154,7 +1154,7 @@ static int correct(const Estimate *x, Residuals *res, double *L) {
 }
 
 /* (28)  X <- exp(dx) X:  A <- exp(eps) A,  y_i <- exp(eps_turn) y_i + J(eps_turn) xi_i */
-static void move(const Estimate *x, const double *dx, const Observed *out) {
+static void move(const FilterState *x, const double *dx, const Observed *out) {
     double twist[6] = {0.0}, R_D[9], J[9], shift[3];
     memcpy(twist + x->pose, dx, (size_t)x->p * sizeof(double));
     exp_and_jacobian(twist, R_D, J);
@@ -1179,7 +1179,7 @@ static void move(const Estimate *x, const double *dx, const Observed *out) {
 }
 
 /* Note that landmarks were seen, and where they should have been by the corrected state. */
-static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
+static void record(const FilterState *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Observed *out,
                    const Residuals *res) {
     Pose pose = pose_of(out->A);
@@ -1206,7 +1206,7 @@ static void record(const Estimate *x, const Landmarks *table, const Seen *seen,
 }
 
 /* Move X by the innovation (28)-(31), and P with it. */
-static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
+static int observe(const FilterState *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Factors *factors,
                    const Observed *out) {
     if (seen->m < 1 || !is_stamp(seen->stamp_ns)
@@ -1252,7 +1252,7 @@ static int observe(const Estimate *x, const Landmarks *table, const Seen *seen,
 
 static PyObject *py_advance(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count) {
     Door door;
-    Estimate x;
+    FilterState x;
     Velocities velocities;
     Interval interval;
     MotionFigures figures;
@@ -1275,7 +1275,7 @@ static PyObject *py_advance(PyObject *Py_UNUSED(self), PyObject *const *args, Py
 
 static PyObject *py_observe(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count) {
     Door door;
-    Estimate x;
+    FilterState x;
     Landmarks table;
     Seen seen;
     PointFigures figures;

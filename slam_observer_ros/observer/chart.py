@@ -37,7 +37,7 @@ class SlamElement:
     a: FloatArray  # (…, n, 3)
 
 
-class Step(NamedTuple):
+class ChartStep(NamedTuple):
     """How exp(x) moves a state of n landmarks."""
 
     X: SlamElement  # Â ← A Â, ŷ_i ← A ŷ_i + a_i
@@ -177,12 +177,12 @@ class Chart:
         """Return P of what :meth:`of_positions` returns."""
         return sheared(P, self.first, self.all_still(points))
 
-    def step(self, x: FloatArray) -> Step:
+    def step(self, x: FloatArray) -> ChartStep:
         """Return exp(x): ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
         axes, k, p = self.axes, self.axes.point, self.axes.p
         parts = x[self.first :].reshape(-1, self.stride)
         xi, omega, u = np.split(parts, [k, k + self.turn], axis=1)
-        return Step(
+        return ChartStep(
             slam_exp(axes.full_pose(x[:p]), axes.full_points(xi)),
             x[p : self.robot],
             axes.full_turns(omega) if self.turn else None,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from slam_observer_ros.common.types import FloatArray, IntArray
 
 
-class Estimate(NamedTuple):
+class FilterState(NamedTuple):
     """X̂ and the covariance P of its errors (ε, c̃, ξ_1 … ξ_n), of a map at rest."""
 
     A: FloatArray  # (4, 4) Â

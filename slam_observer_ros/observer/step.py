@@ -35,7 +35,7 @@ from slam_observer_ros.observer.arrays import (
 from slam_observer_ros.observer.chart import slam_exp
 from slam_observer_ros.observer.flat_arrays import (
     Advanced,
-    Estimate,
+    FilterState,
     Interval,
     Landmarks,
     Limits,
@@ -82,7 +82,7 @@ LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 def advance(
-    x: Estimate,
+    x: FilterState,
     velocities: Velocities,
     interval: Interval,
     figures: MotionFigures,
@@ -172,7 +172,7 @@ def _add_summed(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
 
 
 def _sensitivity(
-    x: Estimate,
+    x: FilterState,
     Ad: FloatArray,
     V: FloatArray,
     dt_s: FloatArray,
@@ -254,7 +254,7 @@ class _Judged(NamedTuple):
 
 
 def observe(
-    x: Estimate,
+    x: FilterState,
     landmarks: Landmarks,
     seen: Seen,
     figures: PointFigures,
@@ -305,7 +305,7 @@ def observe(
 
 
 def _residuals(
-    x: Estimate,
+    x: FilterState,
     landmarks: Landmarks,
     seen: Seen,
     figures: PointFigures,
@@ -380,7 +380,7 @@ def _unseen_s(landmarks: Landmarks, rows: IntArray, stamp_ns: int) -> FloatArray
     return np.where(last_ns < 0, np.inf, to_s(stamp_ns - last_ns))
 
 
-def _judged(x: Estimate, residuals: _Residuals, limits: Limits) -> _Judged | None:
+def _judged(x: FilterState, residuals: _Residuals, limits: Limits) -> _Judged | None:
     """Return S = C P Cᵀ + R, factored; None if it is indefinite.
 
     C is taken in the middle between ŷ_i and the point seen: turning moves at right angles to it.
@@ -455,7 +455,7 @@ def _weights(residuals: _Residuals, judged: _Judged, limits: Limits) -> FloatArr
     return weights
 
 
-def _correct(x: Estimate, residuals: _Residuals, weights: FloatArray) -> FloatArray | None:
+def _correct(x: FilterState, residuals: _Residuals, weights: FloatArray) -> FloatArray | None:
     """Return −K r, K = P Hᵀ S⁻¹ (30), (31), and let P become P − K H P; None if S is indefinite.
 
     Or if digits are lost, see :func:`loses_digits`. H takes C at ŷ_i: so no observation says
@@ -491,7 +491,9 @@ def _write_judged(residuals: _Residuals, judged: _Judged, out: FloatArray) -> No
     out[3 * m] = white.dot(white)
 
 
-def _record(x: Estimate, landmarks: Landmarks, seen: Seen, limits: Limits, out: Observed) -> None:
+def _record(
+    x: FilterState, landmarks: Landmarks, seen: Seen, limits: Limits, out: Observed
+) -> None:
     """Note that landmarks were seen, and where they should have been by the corrected state."""
     rows = seen.rows
     landmarks.counts[rows] += 1

@@ -64,7 +64,7 @@ class Elimination(Protocol):
         """Return the changes (S, d) of the poses from those (b,) of the border."""
 
 
-class Factors:
+class ChainFactors:
     """Factors of the normal equations; LinAlgError is raised if these are singular."""
 
     def __init__(self, equations: Equations) -> None:

@@ -27,9 +27,9 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.arrays import UNKNOWN_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import (
+    ChainFactors,
     COMPILED,
     Equations,
-    Factors,
     landmark_columns,
     sum_by,
 )
@@ -49,7 +49,7 @@ class Step:
 
     start: Solution  # where all was linearised
     end: Solution
-    factors: Factors  # of the equations at ``start``
+    factors: ChainFactors  # of the equations at ``start``
 
     def marginal(self) -> FloatArray:
         """Return the covariance of (η, dc, dp) at ``start``, η and dc being the last ones."""
@@ -96,7 +96,7 @@ class Smoother:
         ``gated``.
         """
         for _ in range(iterations):
-            factors = Factors(self._linearise(start, gated))
+            factors = ChainFactors(self._linearise(start, gated))
             change, border_change = factors.solve()
             step = Step(start, self._moved(start, change, border_change), factors)
             if max(np.abs(change[-1]).max(), np.abs(border_change).max(initial=0.0)) < tolerance:
@@ -112,7 +112,7 @@ class Smoother:
         """Return ``start``, if something is gated there after an iteration without the gate."""
         if not self._observations.some_are_gated(start):
             return start
-        return self._moved(start, *Factors(self._linearise(start, gated=False)).solve())
+        return self._moved(start, *ChainFactors(self._linearise(start, gated=False)).solve())
 
     def _moved(
         self, solution: Solution, change: FloatArray, border_change: FloatArray

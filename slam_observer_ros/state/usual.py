@@ -21,7 +21,7 @@ from slam_observer_ros.geometry.sensor_mounting import Sensed
 from slam_observer_ros.observer import core, step
 from slam_observer_ros.observer.flat_arrays import (
     Advanced,
-    Estimate,
+    FilterState,
     Interval,
     Landmarks,
     Limits,
@@ -196,7 +196,7 @@ def _columns(state: State) -> tuple[IntArray, ...]:
     return table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns
 
 
-def _room(state: State, event: ObservationEvent, x: Estimate, with_expected: bool) -> Observed:
+def _room(state: State, event: ObservationEvent, x: FilterState, with_expected: bool) -> Observed:
     """Return room for the results; none for those that nobody asks for."""
     m, k = len(event.ids), state.axes.point
     return Observed(
@@ -225,7 +225,7 @@ def _limits(settings: Settings, error_time_s: float) -> Limits:
 
 
 def _take_over(
-    state: State, joint: JointCovariance, x: Estimate, landmarks: Landmarks, out: Observed
+    state: State, joint: JointCovariance, x: FilterState, landmarks: Landmarks, out: Observed
 ) -> None:
     """Let a state be as the kernel has left it: x, the landmarks' columns, what has moved."""
     state.relinearisation.note_correction(x.A, out.A)
@@ -248,7 +248,7 @@ def _at_rest(state: State) -> JointCovariance | None:
     return errors.joint
 
 
-def _estimate(state: State, joint: JointCovariance) -> Estimate:
+def _estimate(state: State, joint: JointCovariance) -> FilterState:
     """Return the estimate as plain arrays, of landmarks :func:`_at_rest`."""
     observer, matrix, active = state.observer, joint._matrix, joint.active
     return _estimate_of(
@@ -262,9 +262,9 @@ def _estimate(state: State, joint: JointCovariance) -> Estimate:
 
 def _estimate_of(
     state: State, y_ref: FloatArray, a: FloatArray, P: FloatArray, sizes: tuple[int, int, int]
-) -> Estimate:
+) -> FilterState:
     calibration = state.calibration
-    return Estimate(
+    return FilterState(
         state.observer.A,
         y_ref,
         a,
@@ -278,7 +278,7 @@ def _estimate_of(
 
 
 def _advanced(
-    state: State, x: Estimate, velocities: Velocities, start_ns: int, end_ns: int
+    state: State, x: FilterState, velocities: Velocities, start_ns: int, end_ns: int
 ) -> tuple[int, Advanced]:
     """Move ``x`` on along velocities (27); return whether that was usual, and what it did."""
     interval, out = _interval(state, start_ns, end_ns), _room_for_motion(state)

@@ -54,7 +54,7 @@ DEPTHS_M = (1.0, 4.0, 15.0)
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class WaitingView:
     """One half measurement, and from where: in the frame of P°."""
 
     landmark_id: int
@@ -71,7 +71,7 @@ class View:
         """Whether only the distance was measured."""
         return self.kind == RANGE
 
-    def is_near(self, other: View, times: float = 1.0) -> bool:
+    def is_near(self, other: WaitingView, times: float = 1.0) -> bool:
         """Return whether the sensor has moved less than it takes between this view and another."""
         turn = np.linalg.norm(se3.log(se3.inverse(self.pose) @ other.pose)[:3])
         moved_m = float(np.linalg.norm(self.origin - other.origin))
@@ -102,7 +102,7 @@ class Way:
 
     def view(
         self, state: State, event: ObservationEvent, row: int, covariance: FloatArray
-    ) -> View:
+    ) -> WaitingView:
         """Return the half point at ``row``, with the covariance (3, 3) of its line of sight."""
         A = state.observer.A.copy()
         R, shift, scale = sensor_values(state, event)
@@ -116,7 +116,7 @@ class Way:
         if state.axes.point == 2:
             origin, line = origin * [1.0, 1.0, 0.0], line * [1.0, 1.0, 0.0]
         R_A, x_A = A[:3, :3], A[:3, 3]
-        return View(
+        return WaitingView(
             int(event.ids[row]),
             kind,
             event.sensor_frame,
@@ -136,9 +136,9 @@ class Window:
 
     def __init__(self) -> None:
         self.way = Way()
-        self.views: list[View] = []
+        self.views: list[WaitingView] = []
         self.seen = 0
-        self._last: dict[tuple[int, int, str], View] = {}
+        self._last: dict[tuple[int, int, str], WaitingView] = {}
         self._times = 1.0  # by how much farther apart they are than it takes
 
     def add(self, state: State, event: ObservationEvent, row: int, covariance: FloatArray) -> None:
@@ -157,7 +157,7 @@ class Window:
             del uncertain[0], self.views[0]
         self.views.append(view)
 
-    def _takes(self, view: View) -> bool:
+    def _takes(self, view: WaitingView) -> bool:
         """Return whether a view is not near the last one of the same, and note it."""
         of = view.landmark_id, view.kind, view.sensor_frame
         if of in self._last and self._last[of].is_near(view, self._times):
@@ -170,7 +170,7 @@ class WaitingRoom:
     """Keeps views by id, and the covariance of the way between them."""
 
     def __init__(self) -> None:
-        self._views: dict[int, deque[View]] = {}
+        self._views: dict[int, deque[WaitingView]] = {}
         self._seen: dict[int, int] = {}  # views of each, and …
         self._next: dict[int, int] = {}  # … how many it takes until it is tried again
         self._way = Way()
@@ -218,7 +218,7 @@ def sensor_values(state: State, event: ObservationEvent) -> tuple[FloatArray, Fl
 class _Problem:
     """Where a landmark is (k,), by views and the way between them."""
 
-    def __init__(self, views: list[View], walk: FloatArray, k: int) -> None:
+    def __init__(self, views: list[WaitingView], walk: FloatArray, k: int) -> None:
         self._k, self._views = k, views
         self._origins = np.array([view.origin for view in views])
         self._lines = np.array([view.line for view in views])

@@ -8,7 +8,7 @@ import numpy as np
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.flat_arrays import (
     Advanced,
-    Estimate,
+    FilterState,
     Interval,
     Landmarks,
     Limits,
@@ -48,7 +48,7 @@ def random_estimate(rng, n=None, of_tags=False):
         A = se3.flatten(A)
         y_ref[:, 2] = a[:, 2] = 0.0
     drift = np.diag(rng.uniform(0.0, 1e-6, c)) * rng.integers(2)
-    return Estimate(A, y_ref, a, P, size, first, stride, is_planar, rates, estimated, drift)
+    return FilterState(A, y_ref, a, P, size, first, stride, is_planar, rates, estimated, drift)
 
 
 def random_motion(rng):

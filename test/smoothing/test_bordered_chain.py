@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.smoothing import bordered_chain
-from slam_observer_ros.smoothing.bordered_chain import Factors, SMALL_BORDER
+from slam_observer_ros.smoothing.bordered_chain import ChainFactors, SMALL_BORDER
 
 
 @pytest.fixture(autouse=True, params=['C', 'numpy'])
@@ -24,7 +24,7 @@ borders = pytest.mark.parametrize('landmarks', [5, SMALL_BORDER])
 @borders
 def test_the_solution_is_that_of_dense_algebra(S, landmarks):
     equations, H, g = random_equations(S, landmarks)
-    poses, border = Factors(equations).solve()
+    poses, border = ChainFactors(equations).solve()
     expected = -np.linalg.solve(H, g)
     np.testing.assert_allclose(poses.ravel(), expected[: S * D], atol=1e-8)
     np.testing.assert_allclose(border, expected[S * D :], atol=1e-8)
@@ -35,4 +35,4 @@ def test_the_solution_is_that_of_dense_algebra(S, landmarks):
 def test_the_marginal_is_that_of_the_dense_inverse(S, landmarks):
     equations, H, _ = random_equations(S, landmarks)
     expected = np.linalg.inv(H)[(S - 1) * D :, (S - 1) * D :]
-    np.testing.assert_allclose(Factors(equations).marginal(), expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(ChainFactors(equations).marginal(), expected, rtol=1e-6, atol=1e-9)

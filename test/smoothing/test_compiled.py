@@ -71,9 +71,9 @@ def test_wrong_arguments_are_refused_and_do_not_crash(compiled):
 def test_equations_of_any_size_are_solved_as_the_reference_does(compiled, seed, monkeypatch):
     """Of any calibration that drifts or is shared, of one pose and of five hundred."""
     equations = newton_arguments.any_equations(np.random.default_rng(seed))
-    solved = bordered_chain.Factors(deepcopy(equations)).solve()
+    solved = bordered_chain.ChainFactors(deepcopy(equations)).solve()
     monkeypatch.setattr(bordered_chain, 'COMPILED', None)
-    reference = bordered_chain.Factors(equations).solve()
+    reference = bordered_chain.ChainFactors(equations).solve()
     for one, other in zip(solved, reference, strict=True):
         scale = np.abs(other).max(initial=1e-3)
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-10 * scale)

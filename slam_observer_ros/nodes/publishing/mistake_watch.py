@@ -30,7 +30,7 @@ PAUSE_S = 60.0
 """Time between two searches: before, most of the events are the same."""
 
 
-class Search(Protocol):
+class Slices(Protocol):
     """Looks for mistakes of a set-up, a part at a time (``runs/mistakes.py``)."""
 
     findings: list[Finding]
@@ -39,7 +39,7 @@ class Search(Protocol):
         """Go on for some time; return whether ``findings`` are known."""
 
 
-Begin: TypeAlias = Callable[[Settings, Sequence[Event], Sequence[LandmarkMap] | None], Search]
+Begin: TypeAlias = Callable[[Settings, Sequence[Event], Sequence[LandmarkMap] | None], Slices]
 
 
 class MistakeWatch:
@@ -59,7 +59,7 @@ class MistakeWatch:
         self._node = node
         self._estimator, self._begin_search = estimator, begin_search
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
-        self._search: Search | None = None
+        self._search: Slices | None = None
         self._next_s = 0.0
         self.timer = node.create_steady_timer(PERIOD_S, self._advance)
         self.timer.cancel()

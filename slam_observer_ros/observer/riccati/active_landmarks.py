@@ -18,7 +18,7 @@ from slam_observer_ros.geometry.matrices import symmetric
 from slam_observer_ros.observer.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.observer.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.following_landmarks import FollowingLandmarks
-from slam_observer_ros.observer.riccati.outside_landmarks import Change, OutsideLandmarks
+from slam_observer_ros.observer.riccati.outside_landmarks import OutsideLandmarks, PanelChange
 from slam_observer_ros.observer.riccati.postponed import PostponedCorrection
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ class ActiveLandmarks(JointCovariance):
         is_kept[columns] = False
         kept = np.flatnonzero(is_kept[self._x])
         slots = all_slots[released]
-        change = Change(
+        change = PanelChange(
             self._postponed,
             P[self._x, self._entries],
             self._postponed.root(-P[self._entries, self._entries]),

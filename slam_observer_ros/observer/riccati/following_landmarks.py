@@ -1,6 +1,6 @@
 """Landmarks out of view, to which corrections and changes of x come later, panel by panel.
 
-A view (:class:`.View`) shows them as they will be then, and changes nothing.
+A view (:class:`.PanelView`) shows them as they will be then, and changes nothing.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.chart import Chart
 from slam_observer_ros.observer.riccati.outside_landmarks import (
-    Moved,
+    MovedPanel,
     OutsideLandmarks,
-    View,
+    PanelView,
 )
 from slam_observer_ros.observer.riccati.postponed import PostponedCorrection
 
@@ -70,7 +70,7 @@ class FollowingLandmarks:
 
     # Views
 
-    def views(self, rows: IntArray) -> list[View]:
+    def views(self, rows: IntArray) -> list[PanelView]:
         """Return landmarks (m,) out of view as they are now, panel by panel, ascending."""
         views, outside, k = [], self.outside, self._axes.point
         for number, local in outside.by_panel(self.slots[rows]):
@@ -86,7 +86,7 @@ class FollowingLandmarks:
             turns = self.postponed.turns(blocks[at, k:], panel.turned, self._axes)
             turns = turns if moved is None else turns @ moved.turns[at]
             views.append(
-                View(
+                PanelView(
                     in_panel[at],
                     blocks[at],
                     panel.own[at],
@@ -99,7 +99,7 @@ class FollowingLandmarks:
         return views
 
     def joined(
-        self, rows: IntArray, views: list[View]
+        self, rows: IntArray, views: list[PanelView]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return X (m k, …), B (m k, m k) and references (m, 3) of landmarks in slot order."""
         b = self.outside.width
@@ -201,7 +201,7 @@ class FollowingLandmarks:
         self.outside.make(number, moved)
         self._changed += 1
 
-    def _moved(self, number: int, rows: IntArray, are_out: BoolArray) -> Moved:
+    def _moved(self, number: int, rows: IntArray, are_out: BoolArray) -> MovedPanel:
         return self.outside.moved(number, self._points(rows), are_out)
 
     def _turn(self, number: int, X: FloatArray) -> None:

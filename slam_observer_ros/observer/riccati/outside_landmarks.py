@@ -3,7 +3,7 @@
 The error of a landmark's position is η_i = ξ_i − [y_i°]× ε_Ω, with a reference y_i°: it does not
 move while the robot does. The error of a tag's orientation is ω_i itself. A landmark has a slot,
 some rows of all arrays, and keeps it while it is in view: these rows are out of date then, and X
-is zero there. A change of all landmarks is made panel by panel (:class:`Change`).
+is zero there. A change of all landmarks is made panel by panel (:class:`PanelChange`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from slam_observer_ros.observer.riccati.postponed import (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class PanelChange:
     """A change of all landmarks, begun when x started again: with q entries, then fewer."""
 
     postponed: PostponedCorrection  # corrections until then
@@ -59,7 +59,7 @@ class Panel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moved:
+class MovedPanel:
     """Landmarks of a panel after a change."""
 
     panel: Panel
@@ -70,7 +70,7 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class PanelView:
     """Landmarks (m,) of a panel as they are now, after all that is postponed."""
 
     rows: IntArray  # (m,) which landmarks
@@ -79,7 +79,7 @@ class View:
     references: FloatArray  # (m, 3) metres
     shifts: FloatArray  # (m, 3) how far estimates have yet to be moved, metres
     turns: FloatArray  # (m, 3, 3) how orientations have yet to be turned
-    moved: Moved | None  # their panel after the change that it waits for
+    moved: MovedPanel | None  # their panel after the change that it waits for
 
 
 class OutsideLandmarks:
@@ -95,7 +95,7 @@ class OutsideLandmarks:
         self.panels: list[Panel] = []
         self.size = 0  # q₀
         self.taken: IntArray = np.empty(0, dtype=np.int64)  # (t,) slots
-        self.unchanged: dict[int, Change] = {}  # panels that wait for a change
+        self.unchanged: dict[int, PanelChange] = {}  # panels that wait for a change
         self._unused: list[int] = []
         self._left: list[int] = []  # slots of landmarks that were removed
 
@@ -204,7 +204,7 @@ class OutsideLandmarks:
             self.panels[number].references = references
             begin += len(local)
 
-    def among(self, slots: IntArray, views: list[View]) -> FloatArray:
+    def among(self, slots: IntArray, views: list[PanelView]) -> FloatArray:
         """Return B (m k, m k) of landmarks, ascending, given their views."""
         rows, parts = self.rows(slots), self.by_panel(slots)
         U = [self.matrix.rows_of_U(number) for number, _ in parts]
@@ -227,7 +227,7 @@ class OutsideLandmarks:
 
     # Changes
 
-    def begin(self, change: Change) -> None:
+    def begin(self, change: PanelChange) -> None:
         """Begin a change of all landmarks; there may be no other one yet."""
         self.unchanged = dict.fromkeys(range(len(self.panels)), change)
         self.taken = np.empty(0, dtype=np.int64)
@@ -236,7 +236,7 @@ class OutsideLandmarks:
         if not self.panels:
             self.matrix.end()
 
-    def moved(self, number: int, points: FloatArray, are_out: BoolArray) -> Moved:
+    def moved(self, number: int, points: FloatArray, are_out: BoolArray) -> MovedPanel:
         """Return a panel after its change; landmarks that ``are_out`` are not in x.
 
         The change has not yet moved the estimates ``points`` (slots, 3) of its landmarks.
@@ -270,9 +270,9 @@ class OutsideLandmarks:
         X[rows], V[rows] = change.to_x[of_change], change.own[of_change]
         own[new] = diagonal_blocks(change.own, self._stride)[at]
         references[new] = change.points[at]
-        return Moved(Panel(X, own, references), off - was_off, turns, U, V)
+        return MovedPanel(Panel(X, own, references), off - was_off, turns, U, V)
 
-    def make(self, number: int, moved: Moved) -> None:
+    def make(self, number: int, moved: MovedPanel) -> None:
         """Let a panel have changed."""
         change = self.unchanged.pop(number)
         self.panels[number] = moved.panel
@@ -287,7 +287,9 @@ class OutsideLandmarks:
         self.panels[number].X = X
         return X
 
-    def completed(self, number: int, are_out: BoolArray, moved: Moved | None = None) -> FloatArray:
+    def completed(
+        self, number: int, are_out: BoolArray, moved: MovedPanel | None = None
+    ) -> FloatArray:
         """Return X of a panel with all its columns, maybe after a change it waits for."""
         if moved is None:
             return self._completed(number, self.size, self.taken, are_out)
