@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 import worlds
 from worlds import drive, Loop, simulated_settings, World
 
-from slam_observer_ros.cli.calibration_finder import Finder
+from slam_observer_ros.cli.calibration_finder import CalibrationFinder
 from slam_observer_ros.cli.held_out import Material
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
@@ -263,7 +263,7 @@ def calibrate_drives(seeds: int) -> None:
     off: dict[str, list[float]] = {}
     share: dict[str, list[float]] = {}
     for seed in range(seeds):
-        found = Finder(surveyed_drive(seed), settings, (), lambda: None).find(True)
+        found = CalibrationFinder(surveyed_drive(seed), settings, (), lambda: None).find(True)
         for part in found.parts:
             true = TO_BE_FOUND.get(part.name, part.nominal)
             off.setdefault(part.name, []).append((part.value - true) / part.deviation)

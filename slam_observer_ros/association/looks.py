@@ -49,7 +49,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class SeenTwice:
     """Landmarks (m,) that a sensor has seen twice, as points (m, 3) in the body frame."""
 
     event: ObservationEvent  # the later one …
@@ -62,7 +62,7 @@ class Pairs:
     since_ns: int
 
     @classmethod
-    def of(cls, start: Look, now: Look, moved: list[FloatArray], but: Set[int]) -> Pairs:
+    def of(cls, start: Look, now: Look, moved: list[FloatArray], but: Set[int]) -> SeenTwice:
         """Return the landmarks of two looks, without the ids ``but``.
 
         In between the robot has ``moved`` by odometry.
@@ -110,7 +110,7 @@ class View:
     motion_noise: FloatArray  # (p, p)
 
     @classmethod
-    def of(cls, state: State, seen: list[Pairs], velocities: VelocityHistory) -> View:
+    def of(cls, state: State, seen: list[SeenTwice], velocities: VelocityHistory) -> View:
         """Return the view of pairs of points of one sensor or several."""
         k, A = state.axes.point, state.observer.A
         noise = sensor_noise(state, seen)
@@ -164,7 +164,7 @@ def ids_of(looks: list[Look]) -> set[int]:
     return {i for look in looks for i in look.event.ids.tolist() if i != UNKNOWN_ID}
 
 
-def sensor_noise(state: State, seen: list[Pairs]) -> FloatArray:
+def sensor_noise(state: State, seen: list[SeenTwice]) -> FloatArray:
     """Return the covariances (m, k, k) of both points of landmarks that stand, m²."""
     each = [state.observation_noise.covariances(pairs.event)[pairs.rows] for pairs in seen]
     both: FloatArray = 2.0 * np.concatenate(each)[:, : state.axes.point, : state.axes.point]
@@ -176,7 +176,7 @@ def product(moved: list[FloatArray]) -> FloatArray:
     return reduce(np.dot, moved, np.eye(4))
 
 
-def _motion_noise(state: State, pairs: Pairs, velocities: VelocityHistory) -> FloatArray:
+def _motion_noise(state: State, pairs: SeenTwice, velocities: VelocityHistory) -> FloatArray:
     """Return the covariance (p, p) of the motion between them, its bias included."""
     calibration, end_ns = state.calibration, pairs.event.stamp_ns
     # The velocities before are forgotten: they were off by as much.

@@ -20,8 +20,8 @@ from slam_observer_ros.association.looks import (
     LEAST,
     Look,
     NOISE,
-    Pairs,
     product,
+    SeenTwice,
     sensor_noise,
     SLIPS,
     View,
@@ -216,14 +216,14 @@ class Standing:
         before, self._odd = self._odd, odd
         return 2 * len(odd) < len(ids) and odd.isdisjoint(before)
 
-    def _pairs(self) -> list[Pairs]:
+    def _pairs(self) -> list[SeenTwice]:
         """Return pairs of points seen at the start and lately, each landmark once a sensor."""
         seen, known = [], dict[str, set[int]]()
         for now in reversed(self._latest):
             but = known.setdefault(now.event.sensor_frame, {UNKNOWN_ID})
             for start in self._starts:
                 if start.event.sensor_frame == now.event.sensor_frame:
-                    pairs = Pairs.of(start, now, self.moved[start.moves : now.moves], but)
+                    pairs = SeenTwice.of(start, now, self.moved[start.moves : now.moves], but)
                     but.update(pairs.ids)
                     seen += [pairs] if pairs.ids else []
         return seen

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from slam_observer_ros.cli.calibration_finder import find_noise, Finder, growth
+from slam_observer_ros.cli.calibration_finder import CalibrationFinder, find_noise, growth
 from slam_observer_ros.cli.calibration_stated import (
     depth_text,
     Found,
@@ -205,7 +205,7 @@ def _found(
 ) -> Found:
     if args.only == 'noise':
         return find_noise(materials, request.settings, advance)
-    finder = Finder(materials[0], request.settings, given.assigned, advance)
+    finder = CalibrationFinder(materials[0], request.settings, given.assigned, advance)
     return finder.find(args.keep_noise)
 
 

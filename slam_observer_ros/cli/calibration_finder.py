@@ -153,7 +153,7 @@ MAX_BEHIND = 0.01
 """Share of the points so far off the sensor's axis that it does not measure depth along that."""
 
 
-class Finder:
+class CalibrationFinder:
     """Finds what ``material`` shows; what is ``kept`` is as settings state it.
 
     ``advance`` is called at each run.

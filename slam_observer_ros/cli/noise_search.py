@@ -55,12 +55,12 @@ def kinds_of(settings: Settings) -> list[NoiseKind]:
 
 
 def of_motion(settings: Settings) -> list[NoiseKind]:
-    """Return those of velocities."""
+    """Return the noise parameters of velocities."""
     return _stated(_OF_MOTION, settings)
 
 
 def of_points(settings: Settings) -> list[NoiseKind]:
-    """Return those of points."""
+    """Return the noise parameters of points."""
     return _stated(_OF_POINTS[settings.observation_model], settings)
 
 
@@ -117,7 +117,7 @@ Objective = Callable[[FloatArray], float]
 
 
 @dataclass(frozen=True, slots=True)
-class Factors:
+class LikelyFactors:
     """Logarithms (n,) of the most likely factors.
 
     ``deviations`` (n,) are by the curvature of the log likelihood, where all others are unknown,
@@ -152,10 +152,10 @@ def without_effect(objective: Objective, n: int) -> list[int]:
     return [i for i in range(n) if abs(objective(steps[i]) - nominal) < NO_EFFECT]
 
 
-def most_likely(objective: Objective, n: int) -> Factors:
+def most_likely(objective: Objective, n: int) -> LikelyFactors:
     """Return the maximum of a log likelihood over the logarithms of n factors, from 1 on."""
     if not n:
-        return Factors(np.zeros(0), np.zeros(0))
+        return LikelyFactors(np.zeros(0), np.zeros(0))
     simplex = np.vstack([np.zeros(n), FIRST_STEP * np.eye(n)])
     result = optimize.minimize(
         lambda x: -objective(x),
@@ -170,7 +170,7 @@ def most_likely(objective: Objective, n: int) -> Factors:
         },
     )
     best = np.asarray(result.x, dtype=np.float64)
-    return Factors(best, _deviations(objective, best))
+    return LikelyFactors(best, _deviations(objective, best))
 
 
 def _deviations(objective: Objective, x: FloatArray) -> FloatArray:

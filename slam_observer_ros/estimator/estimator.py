@@ -168,7 +168,7 @@ class Estimator(Estimate):
 
         It is where it was at ``stamp_ns``, nanoseconds, by default :attr:`stamp_ns`: the motion
         since is added if it is known (:meth:`knows_motion_since`). If the pose in a loaded map was
-        unknown, it is known now; of several maps in that of ``map_name``. ``covariance`` (6, 6)
+        unknown, it is known now; of several maps in ``map_name``. ``covariance`` (6, 6)
         is as in :attr:`pose_covariance`; default exact. Raise :exc:`ParameterError` if one of them
         can't be right; nothing is changed then.
         """

@@ -93,7 +93,7 @@ class Placement:
     def place(self, pose: FloatArray, covariance: FloatArray | None, map_name: str = '') -> None:
         """Move the robot; if the pose in a loaded map was not known, it is now.
 
-        Of several maps it is that of ``map_name``; by default the pose does not say which one.
+        Of several maps it is in ``map_name``; by default the pose does not say which one.
         """
         self.was_placed = True
         named = [known for known in self.localiser.maps if map_name and known.name == map_name]

@@ -258,7 +258,7 @@ def _read_apriltag(reader: CdrReader) -> tuple[int, str, FloatArray]:
 def decode_boxes(reader: CdrReader) -> ObservationEvent:
     """Read a vision_msgs/Detection2DArray: in which directions the centres of boxes are.
 
-    Ids are those of a Detection3DArray.
+    Ids are as in a Detection3DArray.
     """
     stamp_ns, frame_id = reader.header()
     boxes = [_read_box(reader) for _ in range(reader.uint32())]

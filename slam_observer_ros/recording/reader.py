@@ -261,7 +261,7 @@ class Recording:
         return self._truth(*topics, selected.transforms, base_frame)
 
     def trajectory(self, topic: Topic, base_frame: str = '') -> Trajectory:
-        """Read the poses of a topic, as those of :meth:`truth`.
+        """Read the poses of a topic, as :meth:`truth` has them.
 
         A RecordingError says if there is none.
         """

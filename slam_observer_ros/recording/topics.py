@@ -136,7 +136,7 @@ def select_topics(
 
 
 def pose_topic(topics: Sequence[Topic], name: str | None) -> Topic:
-    """Return the topic of that name, which has poses, or else that of the true poses.
+    """Return the topic of that name, which has poses, or else the true poses' topic.
 
     Raises a RecordingError that lists the topics if there is none, or several could be meant.
     """

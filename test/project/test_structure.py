@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+from collections import Counter
 from pathlib import Path
 import re
 
@@ -55,6 +57,29 @@ def test_a_velocity_takes_no_more_calls_than_it_did(structure):
 def test_docstrings_are_a_fifth_of_all_lines_at_most(structure):
     docstrings, lines = structure.docstring_lines()
     assert docstrings <= 0.2 * lines
+
+
+def nodes_of_the_package():
+    trees = [(path, ast.parse(path.read_text())) for path in PACKAGE.rglob('*.py')]
+    return [(path, node) for path, tree in trees for node in ast.walk(tree)]
+
+
+def test_no_two_classes_have_one_name():
+    names = Counter(n.name for _, n in nodes_of_the_package() if isinstance(n, ast.ClassDef))
+    assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_docstrings_name_their_subjects():
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    stand_ins = re.compile(r'\b(that|those)\s+of\b')
+    found = [
+        f'{path.name}: {docstring}'
+        for path, node in nodes_of_the_package()
+        if isinstance(node, kinds)
+        and (docstring := ast.get_docstring(node))
+        and stand_ins.search(docstring)
+    ]
+    assert found == []
 
 
 def test_gains_are_distinguished_by_what_they_have_not_by_name():
