@@ -296,7 +296,7 @@ class _Problem:
         """Return how residuals (b, n, 4) change with pose errors and scales, and with points.
 
         The error of the pose is ε in T exp(ε), of all six axes: (b, n, 4, 6 + s); the points are
-        those of the landmarks along the body's axes now: (b, n, 4, 3).
+        the landmarks' along the body's axes now: (b, n, 4, 3).
         """
         views, n_s = self._views, s.shape[1]
         at = (views.landmarks - T[:, None, :3, 3]) @ T[:, :3, :3]

@@ -269,7 +269,7 @@ def heights_of(maps: Iterable[LandmarkMap]) -> dict[int, float]:
 
 
 def check_joint(joint: FloatArray, covariances: FloatArray) -> None:
-    """Check a joint covariance of n or more vectors against those of the landmarks (n, 3, 3).
+    """Check a joint covariance of n or more vectors against the landmarks' own (n, 3, 3).
 
     Raise :exc:`MapError` if there are others on its diagonal, or it is none.
     """

@@ -21,7 +21,7 @@ then of the rotation vectors, along the axes of the map, of those with an orient
 rows it has the entries up to the diagonal as little-endian 64-bit floats, compressed by zlib, in
 base64. ``checksum`` is the CRC-32 of what the lines of the landmarks say, as floats of the same
 kind: of each its id, position, sigma or covariance, orientation and orientation_sigma. So nobody
-changes a landmark, and leaves correlations that are not those of the new one.
+changes a landmark, and leaves correlations that the new one has not.
 """
 
 from __future__ import annotations
@@ -420,7 +420,7 @@ def _correlations(
 ) -> FloatArray:
     """Return the joint covariance of ``landmarks`` as they were read.
 
-    Raise :exc:`MapError` if it can't be right, or is not that of these landmarks, whose
+    Raise :exc:`MapError` if it can't be right, or does not fit these landmarks, whose
     own ``covariances`` (n, 3, 3), m², are known.
     """
     try:

@@ -83,7 +83,7 @@ def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatA
 
 
 def straight_odds(sigmas_m: FloatArray, ranges_m: FloatArray) -> FloatArray:
-    """Return the density of straight ranges where they are right, over that of all detours.
+    """Return the density of straight ranges where they are right, over the density of all detours.
 
     A range through a wall or by a reflection is too long, never too short. A detour may add as
     much as the straight way is long, and anything up to that alike: its density is 1/ρ, of a

@@ -193,7 +193,7 @@ class WaitingRoom:
         if seen < self._next.get(landmark_id, FEWEST_VIEWS):
             return None
         self._next[landmark_id] = min(math.ceil(TRY_AGAIN * seen), seen + MOST_BETWEEN)
-        problem = _Problem(list(views), self._way.covariance, state.axes.point)
+        problem = _PlaceProblem(list(views), self._way.covariance, state.axes.point)
         found = problem.solve(state.settings.range_scale_stddev)
         if found is None:
             return None
@@ -215,7 +215,7 @@ def sensor_values(state: State, event: ObservationEvent) -> tuple[FloatArray, Fl
     return so3.exp(values[:3]), values[3:6], math.exp(values[6])
 
 
-class _Problem:
+class _PlaceProblem:
     """Where a landmark is (k,), by views and the way between them."""
 
     def __init__(self, views: list[WaitingView], walk: FloatArray, k: int) -> None:
