@@ -115,7 +115,7 @@ def _gone_m(time_s: float, duration_s: float, length_m: float) -> float:
 def sightings(pose: FloatArray, codes: FloatArray, errors: FloatArray) -> dict[int, FloatArray]:
     """Return which of ``codes`` (k, 4, 4) are in view of a robot at ``pose`` (4, 4): one or none.
 
-    From ids to poses (4, 4) in the camera's optical frame; ``errors`` (k, 7) are TagErrors'.
+    From ids to poses (4, 4) in the camera's optical frame; ``errors`` (k, 7) are SightErrors'.
     """
     seen = {}
     in_camera = se3.inverse(pose @ MOUNT_OFF @ CAMERA) @ codes

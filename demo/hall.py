@@ -45,7 +45,7 @@ BEARING_NOISE_RAD, ORIENTATION_NOISE_RAD = 0.005, 0.05
 """Standard deviations across the line of sight, with the camera's calibration; of the tag."""
 
 ERROR_TIME_S = 2.0
-"""How long a tag is seen off by about the same, as light and view hardly change."""
+"""How long a landmark is seen off by about the same, as light and view hardly change."""
 
 WHEEL_NOISE = 0.02
 """Of turning and of driving, rad/√s and m/√s: what slips at random."""
@@ -77,13 +77,18 @@ def reflectors(random: np.random.Generator) -> FloatArray:
     )
 
 
-def scan(pose: FloatArray, points: FloatArray, random: np.random.Generator) -> FloatArray:
-    """Return where a laser scanner at a pose (4, 4) sees some of points (n, 3), base frame."""
+def scan(
+    pose: FloatArray, points: FloatArray, errors: FloatArray, random: np.random.Generator
+) -> FloatArray:
+    """Return where a laser scanner at a pose (4, 4) sees some of points (n, 3), base frame.
+
+    ``errors`` (n, 7) are SightErrors', along the line of sight and to its left.
+    """
     points = se3.transform(se3.inverse(pose), points)
     ranges_m = np.linalg.norm(points, axis=1, keepdims=True)
     is_seen = (ranges_m[:, 0] < SCAN_RANGE_M) & (random.random(len(points)) < SCAN_SHARE)
     points, ranges_m = points[is_seen], ranges_m[is_seen]
-    along, across = random.standard_normal((2, len(points), 1))
+    along, across = errors[is_seen, :2].T[:, :, None]
     left = points[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]  # as long as the range
     noise = SCAN_NOISE_M / ranges_m * along * points + SCAN_NOISE_RAD * across * left
     return np.asarray(points + noise)
@@ -110,10 +115,11 @@ class WheelOdometry:
         self.pose = self.pose @ se3.exp(measured * dt_s)
 
 
-class TagErrors:
-    """By what each of ``count`` tags is seen off, in standard deviations (k, 7), as time goes by.
+class SightErrors:
+    """By what each of ``count`` landmarks is seen off, in standard deviations (k, 7).
 
-    Across the image, along the line of sight, and turned.
+    A tag across the image, along the line of sight, and turned. The errors change as time goes by,
+    but slowly: a robot that sees a landmark ten times a second knows hardly more than by once.
     """
 
     def __init__(self, random: np.random.Generator, count: int) -> None:
@@ -132,7 +138,7 @@ def sightings(
 ) -> dict[int, FloatArray]:
     """Return which of ``tags`` (k, 4, 4) are in view of a robot at ``pose`` (4, 4).
 
-    From ids to poses (4, 4) in the camera's optical frame; ``errors`` (k, 7) are TagErrors'.
+    From ids to poses (4, 4) in the camera's optical frame; ``errors`` (k, 7) are SightErrors'.
     """
     seen = {}
     for tag_id, tag in enumerate(se3.inverse(pose @ CAMERA) @ tags):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import hall
@@ -30,6 +30,10 @@ DEEP_QOS = QoSProfile(depth=1000)
 STATIC_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+Sightings: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], dict[int, FloatArray]]
+Scan: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], FloatArray]
+
+
 @dataclass(frozen=True)
 class World:
     """Where the robot drives, and what it sees there."""
@@ -43,9 +47,9 @@ class World:
     lap_s: float
     camera: FloatArray  # (4, 4) pose of the optical frame in the base, as /tf has it
     steps_per_image: int
-    # What is seen at a pose (4, 4): of tags by ids, with their errors (k, 7); of points (m, 3).
-    sightings: Callable[[FloatArray, FloatArray, FloatArray], dict[int, FloatArray]] | None
-    scan: Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray] | None = None
+    # What is seen at a pose (4, 4) with errors (k, 7): of tags by ids, of points where (m, 3).
+    sightings: Sightings | None
+    scan: Scan | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._carried_s = np.inf
         self._odometry = hall.WheelOdometry(self._random)
         self._truth = world.true_pose(0.0)
-        self._tag_errors = hall.TagErrors(self._random, len(world.landmarks))
+        self._errors = hall.SightErrors(self._random, len(world.landmarks))
         self._steps = 0
         self._correction: FloatArray | None = None
         self.seen: list[Seen] = []
@@ -137,6 +141,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._clock_publisher.publish(Clock(clock=MESSAGES.time(stamp_ns)))
         self._publish_odometry(stamp_ns)
         if self._steps % self.world.steps_per_image == 0:
+            self._errors.go_on(self.world.steps_per_image / ODOMETRY_HZ)
             count = self._publish_tags(stamp_ns) + self._publish_scan(stamp_ns)
             by_tf = None if self._correction is None else self._correction @ self._odometry.pose
             self.seen.append(Seen(self.time_s, self._truth, by_tf, count))
@@ -154,7 +159,8 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
     def _publish_scan(self, stamp_ns: int) -> int:
         if self.world.scan is None:
             return 0
-        points = self.world.scan(self._truth, self.world.landmarks, self._random)
+        landmarks, errors = self.world.landmarks, self._errors.values
+        points = self.world.scan(self._truth, landmarks, errors, self._random)
         ids = np.full(len(points), UNKNOWN_ID)
         self._cloud.publish(MESSAGES.point_cloud2(stamp_ns, 'base_link', ids, points))
         return len(points)
@@ -162,9 +168,8 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
     def _publish_tags(self, stamp_ns: int) -> int:
         if self.world.sightings is None:
             return 0
-        self._tag_errors.go_on(self.world.steps_per_image / ODOMETRY_HZ)
-        errors = self._tag_errors.values
-        tags = self.world.sightings(self._truth, self.world.landmarks, errors)
+        landmarks, errors = self.world.landmarks, self._errors.values
+        tags = self.world.sightings(self._truth, landmarks, errors)
         transforms = [
             MESSAGES.transform_stamped(stamp_ns, CAMERA_FRAME, f'tag36h11:{tag_id}', pose)
             for tag_id, pose in tags.items()

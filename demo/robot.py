@@ -159,8 +159,8 @@ def _run(
     """Drive, restarting the observer half-way, or carrying the robot."""
     stop = StopSignal()
     stop.begin()
-    world = _world(options)
-    write_map(folder / LAUNCH_ARGUMENTS['map_file'], _surveyed(world, options.seed), Settings())
+    world = world_of(options)
+    write_map(folder / LAUNCH_ARGUMENTS['map_file'], surveyed(world, options.seed), Settings())
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with ExitStack() as cleanup:
         cleanup.callback(rclpy.try_shutdown)
@@ -195,7 +195,7 @@ def _run(
     return robot, interruption
 
 
-def _world(options: argparse.Namespace) -> World:
+def world_of(options: argparse.Namespace) -> World:
     """Return the world that the options name."""
     random = np.random.default_rng(options.seed)
     tags = World(
@@ -237,7 +237,7 @@ def _world(options: argparse.Namespace) -> World:
     return tags
 
 
-def _surveyed(world: World, seed: int) -> LandmarkMap:
+def surveyed(world: World, seed: int) -> LandmarkMap:
     """Return the map of landmarks as somebody has measured them with a tape."""
     random, count = np.random.default_rng(seed + 1), len(world.landmarks)
     points = world.landmarks[:, :3, 3] if world.sightings else world.landmarks

@@ -75,6 +75,7 @@ def driven() -> Drive:
     none: IntArray = np.zeros(count, dtype=np.int64)
     estimator.load_map(LandmarkMap(np.arange(count), surveyed, covariances, none))
     odometry, run, before = hall.WheelOdometry(random), Drive(points), pose_at(0.0)
+    errors = hall.SightErrors(random, count)
     for step in range(1, round(DURATION_S * HZ)):
         stamp_ns, carried_s = round(step * 1e9 / HZ), CARRIED_BY_S * (step > CARRIED_S * HZ)
         if step == round(CARRIED_S * HZ) + 1:
@@ -84,7 +85,8 @@ def driven() -> Drive:
         before = truth
         velocity = np.array([0.0, 0.0, odometry.turn_rad_s, odometry.forward_m_s, 0.0, 0.0])
         estimator.add(VelocityEvent(stamp_ns, velocity))
-        seen = hall.scan(truth, points, random)
+        errors.go_on(1.0 / HZ)
+        seen = hall.scan(truth, points, errors.values, random)
         estimator.add(ObservationEvent(stamp_ns, np.full(len(seen), UNKNOWN_ID), seen))
         run.truths.append(truth)
         run.poses.append(estimator.pose if estimator.is_localised else None)

@@ -42,7 +42,7 @@ class Robot:
         if has_map:
             self.estimator.load_map(self._surveyed())
         self.odometry = hall.WheelOdometry(self.random)
-        self.errors = hall.TagErrors(self.random, len(self.codes))
+        self.errors = hall.SightErrors(self.random, len(self.codes))
         self.steps, self.ahead_s, self.origin = 0, 0.0, np.eye(4)
         if not has_map:  # the frame of the map that it makes is where it begins
             self.origin = se3.inverse(floor.true_pose(0.0))

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import hall
-from hall_robot import Estimated, Seen
+from hall_robot import error_of, Estimated, Seen
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 import robot
 from robot_report import Interruption
 
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.nodes.ros_interface import TFMessage
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_file import read_parameter_file
+from slam_observer_ros.settings.parameter_table import from_parameters, table
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -81,12 +87,41 @@ def test_a_scan_is_of_reflectors_near_the_robot_within_its_noise():
     assert len(reflectors) == hall.REFLECTORS
     for time_s in np.arange(0.0, hall.LAP_S):
         pose = hall.true_pose(time_s)
-        points = hall.scan(pose, reflectors, random)
-        assert len(points) > 4
+        points = hall.scan(pose, reflectors, random.standard_normal((hall.REFLECTORS, 7)), random)
+        assert len(points) > 2
         assert np.linalg.norm(points, axis=1).max() < hall.SCAN_RANGE_M + 0.2
         in_map = points @ pose[:3, :3].T + pose[:3, 3]
         off_m = np.linalg.norm(in_map[:, None] - reflectors, axis=2).min(axis=1)
         assert off_m.max() < 0.3
+
+
+def test_among_reflectors_the_shipped_file_is_as_sure_as_it_may_be():
+    """Or its noise, or that of the hall, would be misstated."""
+    names = {row.name for row in table(Settings)}
+    given = read_parameter_file(CHECKOUT / 'config' / 'reflectors.yaml')
+    settings = from_parameters(Settings, {k: v for k, v in given.items() if k in names})
+    nees = []
+    for seed in range(2):
+        random = np.random.default_rng(seed)
+        world = robot.world_of(SimpleNamespace(reflectors=True, seed=seed))
+        points, estimator = world.landmarks, Estimator(settings)
+        estimator.load_map(robot.surveyed(world, seed))
+        odometry, errors = hall.WheelOdometry(random), hall.SightErrors(random, len(points))
+        for step in range(1, 250):
+            before, truth = hall.true_pose((step - 1) / 10.0), hall.true_pose(step / 10.0)
+            odometry.advance(before, truth, 0.1)
+            V = np.array([0.0, 0.0, odometry.turn_rad_s, odometry.forward_m_s, 0.0, 0.0])
+            estimator.add(VelocityEvent(step * 100_000_000, V))
+            errors.go_on(0.1)
+            seen = hall.scan(truth, points, errors.values, random)
+            ids = np.full(len(seen), UNKNOWN_ID)
+            estimator.add(ObservationEvent(step * 100_000_000, ids, seen))
+            if step > 50 and step % 10 == 0:
+                pose, P = estimator.uncertain_pose
+                error = error_of(hall.true_pose(estimator.stamp_ns * 1e-9), pose)
+                P = P[np.ix_([3, 4, 2], [3, 4, 2])]
+                nees.append(error @ np.linalg.solve(P, error) / 3.0)
+    assert 0.4 < np.mean(nees) < 2.0
 
 
 def test_wheels_drift_from_the_truth():

@@ -240,6 +240,32 @@ class TestSeveralMaps:
         assert problem.remedy.startswith('take one of the two out of the folder')
         assert caplog.text.count('andmarks are the same') == 1
 
+    @pytest.mark.parametrize('hall', ['hall_0', 'twin'])
+    @pytest.mark.parametrize('has_ids', [False, True])
+    def test_of_two_halls_that_differ_by_one_landmark_it_decides_once_it_is_seen(
+        self, hall, has_ids
+    ):
+        worlds, (known, *_) = self.halls()
+        world = worlds[0]
+        other = world.near(8.0, 3)[0]
+        assert other not in world.near(0.0, 8)
+        points = known.world_points.copy()
+        points[other] += [3.0, 0.0, 0.0]
+        if hall == 'twin':
+            world.points[other] += [3.0, 0.0, 0.0]
+        estimator = Estimator(world.settings(localization_mode='uncertain'))
+        estimator.load_map([known, replace(known, world_points=points, name='twin')])
+        was_seen = False
+        for event in world.drive(0.0, 15.0, count=8):
+            estimator.add(event if has_ids else without_ids(event))
+            was_seen |= isinstance(event, ObservationEvent) and other in event.ids
+            if not was_seen:
+                assert not estimator.is_localised
+                problem = estimator.localisation_problem
+        assert was_seen
+        assert '49 landmarks are the same' in problem.what
+        assert estimator.map_name == hall
+
     def test_a_pose_that_is_given_says_where_in_each_to_look(self):
         """In halls that are surveyed in one frame it says which one it is."""
         worlds, (known, *_) = self.halls()
