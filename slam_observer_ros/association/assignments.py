@@ -86,7 +86,7 @@ def find_assignments(
     r, noise = residuals.on(axes)
     # Which points are of a known landmark in any case: nearly always all, and each of one.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
-    if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at):
+    if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at) == m:
         return [Assignment(_taken(m, at, rows), 0.0)]
     PC, CPC = state.known_errors.predicted(residuals)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)

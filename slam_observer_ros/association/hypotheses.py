@@ -168,14 +168,45 @@ class Hypotheses:
         pose, own = of_each[0]
         if len(of_each) == 1:  # as nearly always
             return own
-        likelihoods = np.exp(-0.5 * np.array([hypothesis.cost for hypothesis in self._all]))
-        weights, total = likelihoods / likelihoods.sum(), own
+        weights, total = self.weights, own
         for (other, covariance), weight in zip(of_each[1:], weights[1:].tolist(), strict=True):
             if total is None or own is None or covariance is None:
                 return None
             d = _difference(pose, other)
             total = total + weight * (covariance - own + d[..., :, None] * d[..., None, :])
         return total
+
+    @property
+    def weights(self) -> FloatArray:
+        """Probabilities (h,) of the hypotheses, as far as one of them is right."""
+        likelihoods = np.exp(-0.5 * np.array([hypothesis.cost for hypothesis in self._all]))
+        return np.asarray(likelihoods / likelihoods.sum())
+
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the joint covariance (m k, m k) of landmarks of the best map, seen by the robot.
+
+        As :meth:`.State.configuration_covariance`, about that map and by all hypotheses. Of a
+        landmark that one of them has not, that one says nothing.
+        """
+        best, k = self.best, self.best.axes.point
+        own = best.configuration_covariance(rows)
+        if own is None or len(self._all) == 1:
+            return own
+        ids, points = best.landmarks.ids[rows], best.observer.body_points(rows)
+        mixed, left = np.zeros_like(own), np.ones(len(own))
+        for hypothesis, weight in zip(self._all[1:], self.weights[1:].tolist(), strict=True):
+            state = hypothesis.state
+            others = state.landmarks.rows_of(ids)
+            known, others = others >= 0, others[others >= 0]
+            covariance = state.configuration_covariance(others)
+            if covariance is None:
+                return None
+            at = np.flatnonzero(np.repeat(known, k))
+            d = (state.observer.body_points(others) - points[known])[:, :k].ravel()
+            mixed[np.ix_(at, at)] += weight * (covariance + np.outer(d, d))
+            left[at] -= weight
+        shares = np.sqrt(left)
+        return shares[:, None] * own * shares + mixed
 
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
@@ -375,7 +406,38 @@ class Hypotheses:
 
 def _are_one(child: _Child, other: _Child) -> bool:
     state, other_state = child.hypothesis.state, other.hypothesis.state
-    return are_one(state, child.event, other_state, other.event)
+    if are_one(state, child.event, other_state, other.event):
+        return True
+    # Where landmarks have ids, these will show.
+    without_ids = is_automatic(state.landmarks.ids).all()
+    return bool(without_ids) and have_one_map(state, other_state)
+
+
+def have_one_map(state: State, other: State) -> bool:
+    """Return whether two hypotheses have the same landmarks at the same places about the robot.
+
+    By how well either of them knows where they are, and the sensor would see them: no observation
+    to come will show then which of them is right. Where one of them has a landmark that the other
+    has not, that is yet to be confirmed.
+    """
+    rows, others = state.landmarks.rows_of(other.landmarks.ids), np.arange(len(other.landmarks))
+    is_common = rows >= 0
+    if not other.landmarks.tentative[~is_common].all():
+        return False
+    only_here = np.setdiff1d(np.arange(len(state.landmarks)), rows)
+    if not state.landmarks.tentative[only_here].all():
+        return False
+    rows, others = rows[is_common], others[is_common]
+    return _agree(state, rows, other, others) and _agree(other, others, state, rows)
+
+
+def _agree(state: State, rows: IntArray, other: State, others: IntArray) -> bool:
+    """Return whether a state expects landmarks (m,) where another one has them."""
+    points = other.observer.body_points(others)
+    seen = ObservationEvent(0, state.landmarks.ids[rows], points)
+    noise, m = state.observation_noise.covariances(seen), len(rows)
+    residuals = state.gains.residuals(rows, points, noise, np.zeros(m), np.ones(m))
+    return bool((state.gains.distances(residuals) <= RESOLUTION).all())
 
 
 def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:

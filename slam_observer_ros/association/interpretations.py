@@ -20,7 +20,7 @@ from slam_observer_ros.association.costs import (
 )
 from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.association.joint_compatibility import joint_cost
-from slam_observer_ros.association.slip import slip
+from slam_observer_ros.association.slip import astray, slip
 from slam_observer_ros.common.types import BoolArray, IntArray, is_automatic
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
@@ -80,7 +80,12 @@ def interpretations(
             return _rejected_or_slipped(state, matched, event, rejected)
     if some_are_unknown or may_name(state, matched):
         found = find_assignments(state, index, event, new_cost, budget, is_alone)
-        return [_with_ids(state, event, assignment, new_ids) for assignment in found]
+        possible = [_with_ids(state, event, assignment, new_ids) for assignment in found]
+        # In a loaded map a robot that is elsewhere is sought anywhere.
+        is_own = bool(is_automatic(state.landmarks.ids).all())
+        if is_own and (event.ids == UNKNOWN_ID).all():
+            possible += _slips_without_ids(state, index, event, new_ids, new_cost, found)
+        return possible
     cost = pairing_cost(state, len(event.ids), matched.residuals)
     return [Interpretation(event, cost, matched=matched)]
 
@@ -157,6 +162,32 @@ def _after_slip(
         return None
     cost += SLIP_COST + pairing_cost(slipped, len(event.ids), matched.residuals)
     return Interpretation(event, cost, slipped, matched=matched)
+
+
+def _slips_without_ids(
+    state: State,
+    index: LandmarkIndex,
+    event: ObservationEvent,
+    new_ids: IntArray,
+    new_cost: float,
+    found: list[Assignment],
+) -> list[Interpretation]:
+    """Take the robot for slipped, where more points are new than a slip is unlikely."""
+    new = min((int(np.sum(one.rows < 0)) for one in found), default=len(event.ids))
+    if new * new_cost <= SLIP_COST or not len(state.landmarks):
+        return []
+    slips: dict[bytes, Interpretation] = {}
+    for other in astray(state):
+        for assignment in find_assignments(other, index, event, new_cost, np.inf, False)[:1]:
+            is_new, taken_for = assignment.rows < 0, assignment.rows.tobytes()
+            if np.sum(is_new) >= new or taken_for in slips:
+                continue
+            taken = _with_ids(state, event, assignment, new_ids).event
+            slipped = _after_slip(state, match(state, taken), taken)
+            if slipped is not None:
+                spared = np.sum(is_new) * (outlier_cost(state) - new_cost)
+                slips[taken_for] = replace(slipped, cost=slipped.cost - float(spared))
+    return list(slips.values())
 
 
 def _are_rejected(state: State, residuals: Residuals) -> BoolArray:

@@ -6,6 +6,7 @@ covariance of pose and landmarks.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import math
 
 import numpy as np
@@ -29,6 +30,11 @@ MAX_DURATION_S = 4.0
 LARGE_TURN_RAD = 0.3
 """Turn, radians, that a correction, which is linear in it, does not find well."""
 
+SHORT_S, TURN_RAD = 1.0, 0.5
+"""Time without odometry, seconds, and turns, after which points without ids are looked for: what
+is about one of these turns is found by corrections that are linear in it.
+"""
+
 ITERATIONS = 10
 """Gauss-Newton steps to the likeliest pose; the last ones hardly move it."""
 
@@ -42,28 +48,45 @@ def slip(state: State, matched: MatchedObservation) -> float:
     Its pose is then as uncertain as if there had been no odometry for as long as that takes. The
     observation is yet to be used.
     """
-    # The noise of a motion without odometry, for as long as it takes.
+    # The noise of a motion without odometry, for as long as it takes, to where landmarks put it.
     observer, start = state.observer, state.observer.A.copy()
     needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
-    stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
-    noise = state.motion_noise.covariances(stray)
-    variances = np.maximum(np.diagonal(noise[1])[state.axes.pose], MIN_VARIANCE)
-    # That motion, to where the landmarks put the robot.
-    after = _pose_after(state, matched, variances)
+    variances = _variances(state, needed_s)
+    _stray(state, needed_s, _pose_after(state, matched, variances))
+    state.counts['slip'] += 1
+    strayed = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
+    return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
+
+
+def astray(state: State) -> Iterator[State]:
+    """Yield copies of a state from which points without ids show where a slip may have led it."""
+    for turn_rad in (0.0, TURN_RAD, -TURN_RAD):
+        other = state.copy()
+        _stray(other, SHORT_S, other.observer.A @ se3.exp(np.array([0, 0, turn_rad, 0, 0, 0])))
+        yield other
+
+
+def _stray(state: State, duration_s: float, after: FloatArray) -> None:
+    """Move a state to Â = ``after`` (4, 4), without odometry for so long."""
+    stray = HeldVelocities.unknown(np.array([0.0, duration_s]))
     motion = Motion(
-        path=np.array([start, after, after]),
+        path=np.array([state.observer.A.copy(), after, after]),
         measured_velocities=stray.body_velocities,
         dt_s=stray.dt_s,
-        covariances=noise,
+        covariances=state.motion_noise.covariances(stray),
         duration_s=0.0,
         at_ends=None,
         calibration=state.calibration,
         is_slip=True,
     )
     state.propagate(motion)
-    state.counts['slip'] += 1
-    strayed = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
-    return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
+
+
+def _variances(state: State, duration_s: float) -> FloatArray:
+    """Return the variances (p,) of a motion without odometry for so long."""
+    noise = state.motion_noise.covariances(HeldVelocities.unknown(np.array([0.0, duration_s])))
+    variances: FloatArray = np.diagonal(noise[1])[state.axes.pose]
+    return np.maximum(variances, MIN_VARIANCE)
 
 
 def _duration_s(state: State, matched: MatchedObservation) -> float:

@@ -364,8 +364,8 @@ KINDS = {
     ),
     'unexpected_place': Kind(
         Level.WARNING,
-        'nothing that is seen is where the map has it: if the robot slipped or was carried, '
-        'without ids it is found again in a loaded map only',
+        'nothing that is seen is where the map has it: if the robot was carried to where it knows '
+        'nothing, without ids it is found again in a loaded map only',
         'give its pose on initialpose, or start again',
     ),
     'doubled_landmark': Kind(

@@ -242,9 +242,10 @@ class Estimate:
 
         In the body frame, of k coordinates (2 in ``two_d_mode``, else 3), as of the last
         observation: ask for it in ``on_update``. ``rows`` (m,) are indices into ``landmark_ids``.
+        It includes that the most likely hypothesis may be wrong.
         None where the filter knows none, or landmarks are fixed, whose errors nobody knows.
         """
-        return self._state.configuration_covariance(self._state.confirmed[rows])
+        return self._hypotheses.configuration_covariance(self._state.confirmed[rows])
 
     @property
     def landmark_velocities(self) -> FloatArray:

@@ -8,6 +8,7 @@ these lie to each other as old ones do, in one way only, they are those.
 
 from __future__ import annotations
 
+from collections import Counter
 import logging
 import math
 
@@ -45,6 +46,9 @@ NEIGHBOURS = 3
 """Landmarks next to one to which distances say how well it is known where it lies there."""
 
 
+HALF = 0.5
+"""Share of how often two would be seen side by side from which on they are two."""
+
 SHOULD_BE_SEEN = 3.0
 """−ln of the probability below which it is no chance that a landmark in view is not seen."""
 
@@ -55,7 +59,7 @@ class LoopClosure:
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._searched: tuple[bytes, int] | None = None
-        self._apart: set[tuple[int, int]] = set()  # ids that were seen at once, side by side
+        self._apart: Counter[tuple[int, int]] = Counter()  # ids seen at once, side by side
         self._near_m = math.inf  # how far side by side is
         self._doubled: set[tuple[int, int]] = set()  # ids that were counted as such
 
@@ -79,7 +83,7 @@ class LoopClosure:
         return has_closed
 
     def note(self, state: State, stamp_ns: int) -> None:
-        """Note which landmarks an observation, already used, has shown to be two."""
+        """Count which landmarks an observation, already used, has shown side by side."""
         landmarks = state.landmarks
         rows = np.flatnonzero(landmarks.last_seen_ns == stamp_ns)
         if len(rows) < 2:
@@ -87,7 +91,7 @@ class LoopClosure:
         points, ids = state.observer.points[rows], landmarks.ids[rows].tolist()
         lengths_m = np.linalg.norm(points[:, None] - points, axis=2)
         for i, j in zip(*np.nonzero(np.triu(lengths_m < self._near_m, 1)), strict=True):
-            self._apart.add((min(ids[i], ids[j]), max(ids[i], ids[j])))
+            self._apart[min(ids[i], ids[j]), max(ids[i], ids[j])] += 1
 
     def is_due(self, state: State, stamp_ns: int) -> bool:
         """Return whether it is time to look for landmarks that are one."""
@@ -119,7 +123,7 @@ class LoopClosure:
         """Merge landmarks that are as near each other as one would be; return how many."""
         own, merged = _own(state), 0
         while len(own) > 2 and (pair := self._twins(state, own)) is not None:
-            if state.merge(*pair, MOST) > MOST:
+            if state.merge(*pair, _most(state)) > _most(state):
                 break
             own = own[own != pair[1]]
             own -= own > pair[1]
@@ -150,7 +154,7 @@ class LoopClosure:
         if not len(at):
             return
         r, S = _differences(state, absent[at], added[new])
-        differ = mahalanobis(r, S) ** 2 > MOST * state.axes.point
+        differ = mahalanobis(r, S) ** 2 > _most(state) * state.axes.point
         pairs = np.column_stack([landmarks.ids[absent[at]], landmarks.ids[added[new]]])[differ]
         doubled = {(int(old), int(own)) for old, own in pairs} - self._doubled
         state.counts['doubled_landmark'] += len(doubled)
@@ -173,22 +177,30 @@ class LoopClosure:
         first = np.minimum(own[at[:, 0]], own[at[:, 1]])
         second = np.maximum(own[at[:, 0]], own[at[:, 1]])
         ids = np.sort(np.column_stack([landmarks.ids[first], landmarks.ids[second]]), axis=1)
-        may_be = np.array([tuple(pair) not in self._apart for pair in ids.tolist()], dtype=bool)
+        # Two are seen side by side whenever they are seen, but for what the sensor misses; one is
+        # where a false point is beside it.
+        p, beside = landmarks.likely_share, np.array([self._apart[a, b] for a, b in ids.tolist()])
+        alone = np.minimum(landmarks.counts[first], landmarks.counts[second]) - beside
+        may_be = beside < HALF * p * (alone + beside)
         may_be &= landmarks.last_seen_ns[first] != landmarks.last_seen_ns[second]
         if not may_be.any():
             return None
-        at, first, second = at[may_be], first[may_be], second[may_be]
+        at, first, second, alone = at[may_be], first[may_be], second[may_be], alone[may_be]
         # How much likelier it is that they are one, there and not seen side by side.
         r, S = _differences(state, first, second)
         squares = mahalanobis(r, S) ** 2
         log_density = np.log(np.maximum(densities[at[:, 0]], densities[at[:, 1]]))
         odds = -0.5 * (squares + np.linalg.slogdet(2.0 * math.pi * S)[1]) - log_density
-        was_gone = landmarks.last_seen_ns[first] < landmarks.born_ns[second]
-        missed = np.where(was_gone, landmarks.missed[first] * landmarks.seen_share, 0.0)
-        odds += np.log1p(missed)
-        best = int(np.argmax(np.where(squares <= MOST * k, odds, -np.inf)))
+        odds -= alone * math.log1p(-p)
+        best = int(np.argmax(np.where(squares <= _most(state) * k, odds, -np.inf)))
         is_sure = odds[best] > -math.log(state.settings.localization_error_probability)
-        return (first[[best]], second[[best]]) if is_sure and squares[best] <= MOST * k else None
+        is_sure &= squares[best] <= _most(state) * k
+        return (first[[best]], second[[best]]) if is_sure else None
+
+
+def _most(state: State) -> float:
+    """Return the normalised square, per axis, of two landmarks that may be one: at the gate."""
+    return state.settings.rejection_threshold**2 / state.axes.point
 
 
 def _own(state: State) -> IntArray:

@@ -12,7 +12,11 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-from slam_observer_ros.association.hypotheses import are_one, Hypotheses
+from slam_observer_ros.association.hypotheses import (
+    are_one,
+    have_one_map,
+    Hypotheses,
+)
 from slam_observer_ros.association.joint_compatibility import (
     huber_loss,
     JointSearch,
@@ -214,6 +218,48 @@ def test_states_that_took_two_look_alikes_for_each_other_are_one_where_their_map
     assert not are_one(state, event, other, swapped), 'each has a point where the other has none'
     elsewhere.observer.A[...] = elsewhere.observer.A @ se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
     assert not are_one(state, event, elsewhere, swapped), 'the robot is 1 m off'
+
+
+def test_hypotheses_are_one_where_no_view_to_come_can_show_which_is_right():
+    estimator = Estimator(replace(SPATIAL, confirmations=1))
+    stand(estimator, 0.0)
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 3.0]])
+    observe(estimator, 0.0, points)
+    state = estimator._hypotheses.best
+    deviation_m = np.sqrt(
+        state.observation_noise.covariances(ObservationEvent(0, [7], points[:1]))[0, 0, 0]
+    )
+    other, more, elsewhere = (state.copy() for _ in range(3))
+    other.observer.relocate_landmarks(np.array([0]), points[:1] + [deviation_m, 0.0, 0.0])
+    assert have_one_map(state, other) and have_one_map(other, state)
+    other.observer.relocate_landmarks(np.array([0]), points[:1] + [0.5, 0.0, 0.0])
+    assert not have_one_map(state, other), 'a landmark is elsewhere'
+    elsewhere.observer.A[...] = elsewhere.observer.A @ se3.exp(np.array([0, 0, 0, 0.5, 0, 0]))
+    assert not have_one_map(state, elsewhere), 'the robot is elsewhere'
+    more.remove(np.array([2]))
+    assert have_one_map(state, more) and have_one_map(more, state)
+    state.landmarks.tentative[2] = False
+    assert not have_one_map(state, more), 'a landmark that is sure is in one of them'
+    assert not have_one_map(more, state)
+
+
+def test_the_covariance_of_a_map_is_that_of_all_hypotheses():
+    estimator = Estimator(replace(PLANAR, confirmations=1, min_support=1))
+    stand(estimator, 0.0)
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    observe(estimator, 0.0, points)
+    hypotheses = estimator._hypotheses
+    own = estimator.configuration_covariance(np.arange(2))
+    other = hypotheses._all[0].copy()
+    other.cost = 2.0 * np.log(3.0)  # one in four
+    hypotheses._all.append(other)
+    assert_allclose(hypotheses.weights, [0.75, 0.25])
+    assert_allclose(estimator.configuration_covariance(np.arange(2)), own)
+    other.state.observer.relocate_landmarks(np.array([0]), points[:1] + [1.0, 0.0, 0.0])
+    mixed = estimator.configuration_covariance(np.arange(2))
+    assert_allclose(mixed[0, 0], own[0, 0] + 0.25)
+    other.state.remove(np.array([0]))
+    assert_allclose(np.diag(estimator.configuration_covariance(np.arange(2))), np.diag(own))
 
 
 def test_one_hypothesis_at_most_if_no_more_are_wanted():

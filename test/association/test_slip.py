@@ -11,6 +11,7 @@ import pytest
 
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -200,11 +201,23 @@ def without_ids(_, event):
 
 
 @seeds
-def test_without_ids_there_is_one_warning_where_landmarks_are_far_apart(seed, caplog):
-    world, _ = carried(PLANAR, seed, landmarks=6)
+def test_without_ids_a_robot_that_is_carried_is_found_again_where_it_sees_what_it_knows(seed):
+    world, moved = carried(PLANAR, seed)
     estimator, _ = run(world.with_observations(without_ids), PLANAR)
-    assert estimator.counts['unexpected_place'] == 1
-    assert 'Nothing that is seen is where the map has it' in caplog.text
+    pose = moved @ world.true_pose(world.events[-1].stamp_ns)
+    assert estimator.counts['slip'] >= 1
+    assert np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]) < 0.3
+
+
+@seeds
+def test_without_ids_it_is_said_where_nothing_is_as_it_was(seed):
+    world = gain_worlds.drive(PLANAR, 40.0, seed, noise=0.5, landmarks=6)
+    elsewhere = gain_worlds.drive(PLANAR, 40.0, seed + 10, noise=0.5, landmarks=6)
+    events = [one for one in world.events if seconds(one) < 20.0]
+    events += [one for one in elsewhere.events if seconds(one) >= 20.0]
+    world = replace(world, events=events)
+    estimator, _ = run(world.with_observations(without_ids), PLANAR)
+    assert any(estimator.counts[kind] for kind in UNEXPECTED_POSES)
 
 
 @seeds

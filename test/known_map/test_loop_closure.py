@@ -139,6 +139,16 @@ def test_two_landmarks_that_were_seen_at_once_side_by_side_are_two():
     assert closure.merge_twins(state) == 0
 
 
+def test_a_false_point_beside_a_landmark_makes_it_no_two():
+    """Of two that the sensor hardly misses one would not be seen alone, again and again."""
+    state, closure = twins(0.03), LoopClosure()
+    state.landmarks.note_in_view(np.arange(18), np.ones(18, dtype=bool))
+    state.landmarks.last_seen_ns[-2:] = 7
+    closure.note(state, 7)
+    state.landmarks.last_seen_ns[-1] = 9
+    assert closure.merge_twins(state) == 1
+
+
 def test_after_a_merger_all_that_was_seen_of_both_is_smoothed_as_of_one():
     settings = replace(PLANAR, observation_correlation_time=0.0, relinearization_interval=5)
     world = gain_worlds.drive(settings, 30.0)
