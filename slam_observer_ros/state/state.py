@@ -225,11 +225,11 @@ class State:
 
     def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
         """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: :meth:`.Gains.merge`."""
+        ids = self.landmarks.ids[copies]  # which go
         square = self.gains.merge(rows, copies, most)
         if square <= most:
             self.relinearisation.merge(rows, copies)
-            ids, seen_ns = self.landmarks.ids[copies], self.landmarks.last_seen_ns
-            self.counts.note(Change.MERGED, ids, int(seen_ns.max()))
+            self.counts.note(Change.MERGED, ids, int(self.landmarks.last_seen_ns.max()))
         return square
 
     def forget(self, rows: IntArray, why: Change, stamp_ns: int) -> None:
