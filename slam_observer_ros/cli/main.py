@@ -42,7 +42,7 @@ EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EX
 
 COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
-    'convert': ('convert', 'make a recording of a public data set'),
+    'convert': ('convert', 'make a recording of a public data set, or a TUM file of poses'),
     'map': ('map', 'make a map file of a map of another program, or check one'),
     'replay': ('replay', 'run a recording through the observer'),
     'calibrate': ('calibrate', 'find how sensor and odometry err, or their noise alone'),
