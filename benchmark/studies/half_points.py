@@ -1,17 +1,20 @@
-"""Ranges alone: Plaza 1 and 2, in a survey of the anchors and without.
+"""Ranges alone: Plaza 1 and 2, in a survey of the anchors, without, and lost in it.
 
 ``python benchmark/studies/half_points.py`` prints errors against the truth by the shipped
-``uwb.yaml``. By how much the ranges, which are 7 % long, are so is not known. The data is not
+``uwb.yaml``, and how many of 100 starts are found on Plaza and in random halls. By how much the ranges, which are 7 % long, are so is not known. The data is not
 shipped: it is read from ``plaza`` in the folder that SLAM_OBSERVER_DATA names.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 import logging
+import math
 import os
 from pathlib import Path
 import sys
 import time
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,7 +24,7 @@ from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import Event, ObservationEvent, RANGE, VelocityEvent
+from slam_observer_ros.events import BEARING, Event, ObservationEvent, RANGE, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -30,6 +33,23 @@ from slam_observer_ros.settings.parameter_table import from_parameters, table
 
 DATA = Path(os.environ.get('SLAM_OBSERVER_DATA', '../shared/data')) / 'plaza'
 SURVEY_M, START_M, START_RAD = 0.05, 0.05, 0.05
+STARTS, MOST_M, WRONG_M = 100, 30.0, 2.0
+STEP_S, SPEED = 0.1, 0.7
+
+HALL = Settings(
+    two_d_mode=True,
+    localization_mode='uncertain',
+    observation_model='range_bearing',
+    range_noise=0.1,
+    bearing_noise=0.02,
+    range_scale_stddev=0.1,
+    angular_velocity_noise=(0.01, 0.01, 0.01),
+    linear_velocity_noise=(0.02, 0.01, 0.01),
+    max_rejections=1_000_000,
+)
+
+Found: TypeAlias = tuple[float, float, bool]
+"""Metres driven, error of the position there, metres, and whether the robot was found."""
 
 
 def main() -> None:
@@ -38,6 +58,97 @@ def main() -> None:
     for run in (1, 2):
         for is_surveyed in (True, False):
             sys.stdout.write(f'{row(run, is_surveyed)}\n')
+    for run in (1, 2):
+        write_lost(f'Plaza {run}', lost_on_plaza(run))
+    for name, kind, in_a_line, walls in (
+        ('ranges', RANGE, False, 0.0),
+        ('ranges, 20 % of them through walls', RANGE, False, 0.2),
+        ('bearings', BEARING, False, 0.0),
+        ('ranges, anchors in a line', RANGE, True, 0.0),
+    ):
+        found = (lost_in_hall(seed, kind, in_a_line, walls) for seed in range(STARTS))
+        write_lost(f'halls, {name}', found)
+
+
+def write_lost(name: str, found: Iterable[Found]) -> None:
+    """Write how many starts were found, how many of them wrong, and after which drive."""
+    results = list(found)
+    drives = [drive_m for drive_m, _, is_found in results if is_found]
+    wrong = sum(off_m > WRONG_M for _, off_m, is_found in results if is_found)
+    after = np.percentile(drives, [50, 90]).round(1).tolist() if drives else '–'
+    sys.stdout.write(
+        f'lost, {name}: found {len(drives)} of {len(results)}, wrong {wrong}, after {after} m '
+        '(median, 90 %)\n'
+    )
+
+
+def lost_on_plaza(run: int) -> Iterator[Found]:
+    """Start lost at any time of the first three quarters of a run."""
+    events, truth, anchors = read(run)
+    for start in np.random.default_rng(1).integers(50, len(events) * 3 // 4, STARTS):
+        yield lost(events[int(start) :], truth, anchors, settings())
+
+
+def lost(
+    events: Sequence[Event], truth: Trajectory, anchors: LandmarkMap, config: Settings
+) -> Found:
+    """Drive until the robot is found, or for MOST_M; return drive, error, and whether it was."""
+    estimator, driven_m = Estimator(config), 0.0
+    estimator.load_map(anchors)
+    last: VelocityEvent | None = None
+    for event in events:
+        estimator.add(event)
+        if isinstance(event, VelocityEvent):
+            if last is not None:
+                speed = float(np.linalg.norm(last.body_velocity[3:]))
+                driven_m += speed * 1e-9 * (event.stamp_ns - last.stamp_ns)
+            last = event
+        elif estimator.is_localised:
+            at = np.searchsorted(truth.stamps_ns, estimator.stamp_ns or 0).clip(max=len(truth) - 1)
+            off = (estimator.pose - truth.poses[at])[:3, 3]
+            return driven_m, float(np.linalg.norm(off)), True
+        if driven_m > MOST_M:
+            break
+    return driven_m, math.nan, False
+
+
+def lost_in_hall(seed: int, kind: int, in_a_line: bool, walls: float) -> Found:
+    """Start lost in a hall of 10 to 40 m with eight anchors, and drive at random."""
+    rng, n = np.random.default_rng(seed), 8
+    size = rng.uniform(10.0, 40.0, 2)
+    points = np.column_stack([rng.uniform(0.0, size, (n, 2)), np.zeros(n)])
+    if in_a_line:
+        turn = rng.uniform(0.0, np.pi)
+        along = rng.uniform(-0.5, 0.5, n) * size[0]
+        points[:, :2] = size / 2.0 + np.outer(along, [np.cos(turn), np.sin(turn)])
+    anchors = LandmarkMap(
+        np.arange(n), points, np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.zeros(n, np.int64)
+    )
+    A, scale, turn = pose_of(*rng.uniform(1.0, size - 1.0), rng.uniform(-np.pi, np.pi)), 1.0, 0.0
+    scale += 0.05 * rng.normal()
+    events: list[Event] = []
+    stamps_ns, poses = [], []
+    for step in range(round(MOST_M / SPEED / STEP_S) + 50):
+        turn = rng.uniform(-0.6, 0.6) if step % 20 == 0 else turn
+        V, stamp_ns = np.array([0.0, 0.0, turn, SPEED, 0.0, 0.0]), round(1e9 * STEP_S) * step
+        noise = np.array([0.0, 0.0, 0.01, 0.02, 0.0, 0.0]) / np.sqrt(STEP_S)
+        stamps_ns.append(stamp_ns)
+        poses.append(A)
+        events.append(VelocityEvent(stamp_ns, V + noise * rng.normal(size=6)))
+        if step % 4 == 0:
+            rows = rng.permutation(n)[:3]
+            lines = se3.transform(se3.inverse(A), points[rows])
+            ranges_m = np.linalg.norm(lines, axis=1, keepdims=True)
+            if kind == BEARING:
+                shown = lines / ranges_m + 0.02 * rng.normal(size=lines.shape) * [1.0, 1.0, 0.0]
+                shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+            else:
+                detours = (rng.random((3, 1)) < walls) * rng.exponential(1.0, (3, 1))
+                shown = (ranges_m + detours + 0.1 * rng.normal(size=(3, 1))) / scale
+                shown = shown * [1.0, 0.0, 0.0]
+            events.append(ObservationEvent(stamp_ns, rows, shown, kinds=np.full(3, kind)))
+        A = A @ se3.exp(STEP_S * V)
+    return lost(events, Trajectory.from_samples(stamps_ns, poses), anchors, HALL)
 
 
 def row(run: int, is_surveyed: bool) -> str:

@@ -338,6 +338,16 @@ KINDS = {
     'ambiguous_place': Kind(
         Level.WARNING, 'what was seen fits {number} in {where}, {places}', GIVE_THE_POSE
     ),
+    'anchor_biased': Kind(
+        Level.WARNING,
+        'ranges from landmark {anchor} are {off_m:.2f} m too {towards} wherever they are measured',
+        "survey that anchor again, and calibrate its antenna's delay",
+    ),
+    'side_undecided': Kind(
+        Level.NOTE,
+        'the views of landmarks {ids} fit two places each, one on either side of the way',
+        'drive a curve',
+    ),
     'drive_a_curve': Kind(
         Level.WARNING,
         'the ranges or directions seen so far fit {number} places in {where}, {places}',

@@ -25,6 +25,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import Localiser
 from slam_observer_ros.known_map.merging import map_of
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.state.half_points import HalfPoints
 from slam_observer_ros.state.state import State
 
 
@@ -44,6 +45,7 @@ class Estimate:
         self._hypotheses, self._localiser = hypotheses, localiser
         self._counts = Outcomes(is_kept=hypotheses.best.counts.is_kept)
         self._warnings = EventWarnings()
+        self._half_points = HalfPoints(self._counts)
 
     @property
     def counts(self) -> Counter[str]:
@@ -105,6 +107,16 @@ class Estimate:
         places = [] if self.is_localised else self._localiser.places
         poses = [place.transform @ self._state.observer.A for place in places]
         return np.array(poses).reshape(-1, 4, 4)
+
+    @property
+    def anchor_biases(self) -> dict[int, float]:
+        """Metres by which ranges from landmarks are too long everywhere, by id."""
+        return self._half_points.offsets.constant
+
+    @property
+    def open_sides(self) -> list[int]:
+        """Ids of new landmarks that ranges or directions put in two places."""
+        return self._half_points.open_sides
 
     @property
     def map_name(self) -> str:

@@ -40,7 +40,7 @@ from slam_observer_ros.known_map.landmark_map import heights_of, LandmarkMap
 from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import checked, table
-from slam_observer_ros.state.half_points import HalfPoints, judged
+from slam_observer_ros.state.half_points import judged
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +86,6 @@ class Estimator(Estimate):
         self._on_update, self._on_stamps = on_update, on_stamps
         self._on_motion, self._on_jump = on_motion, on_jump
         self._loop_closure = LoopClosure()
-        self._half_points = HalfPoints(self._counts)
         self.reset(initial_pose)
         self._warnings.unused_settings(settings, self._state.gains)
 

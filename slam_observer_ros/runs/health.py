@@ -7,7 +7,7 @@ show. ``input_health.py`` judges what a recording holds, ``error_health.py`` its
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 from typing import Any, Protocol
@@ -110,6 +110,10 @@ class Diagnosed(Protocol):
     @property
     def motion_factors(self) -> Sequence[MotionFactor]: ...  # noqa: D102
     @property
+    def anchor_biases(self) -> Mapping[int, float]: ...  # noqa: D102
+    @property
+    def open_sides(self) -> Sequence[int]: ...  # noqa: D102
+    @property
     def lyapunov(self) -> float: ...  # noqa: D102
     @property
     def stamp_ns(self) -> int | None: ...  # noqa: D102
@@ -148,7 +152,25 @@ def of_estimate(estimator: Diagnosed) -> list[Finding]:
         *of_calibration(estimator.calibration),
         *of_mounting(estimator.calibration),
         *of_noise(estimator.motion_factors),
+        *of_half_points(estimator.anchor_biases, estimator.open_sides),
     ]
+
+
+def of_half_points(biases: Mapping[int, float], open_sides: Sequence[int]) -> list[Finding]:
+    """Name landmarks whose ranges are off everywhere, and those that fit on two sides."""
+    biased = [
+        found(
+            'anchor_biased',
+            anchor=anchor,
+            off_m=abs(off_m),
+            towards='short' if off_m < 0 else 'long',
+        )
+        for anchor, off_m in sorted(biases.items())
+    ]
+    if not open_sides:
+        return biased
+    ids = ', '.join(str(landmark_id) for landmark_id in open_sides)
+    return [*biased, found('side_undecided', ids=ids)]
 
 
 def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:

@@ -9,6 +9,7 @@ directions and a completed point are the same correction, but for rounding.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 import math
@@ -25,10 +26,18 @@ from slam_observer_ros.events import (
     POINT,
     RANGE,
 )
+from slam_observer_ros.geometry.matrices import diagonal_blocks
 from slam_observer_ros.geometry.sensor_mounting import directions_of
+from slam_observer_ros.observer.robust import straight_odds, straight_share
 from slam_observer_ros.sensor_models.observation_noise import point_covariances
+from slam_observer_ros.state.matching import calibrated, residuals_of
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.waiting_room import sensor_values, WaitingRoom, Window
+from slam_observer_ros.state.waiting_room import (
+    LEAST_MOVE_M,
+    sensor_values,
+    WaitingRoom,
+    Window,
+)
 
 UNMEASURED_M = 1e3
 """Standard deviation of a completed point where nothing was measured: as large as a message may
@@ -45,6 +54,18 @@ MEASURED = np.array(
 )
 """Which of range, azimuth and elevation is measured, by kind."""
 
+KEPT, FEWEST = 200, 40
+"""Differences of ranges that are kept, and that it takes to judge them."""
+
+LEAST_ANCHORS = 3
+"""Landmarks among which one that is off is known from those that are not."""
+
+MEDIAN_OF_NORMAL = 0.6745
+"""Of what is drawn from a normal distribution, without its sign, in standard deviations."""
+
+LEAST_SHARE = 1e-3
+"""Probability of a straight way below which a range says nothing, either way."""
+
 LEAST_LEVEL = 0.1
 """Cosine of the steepest line of sight, 84°, whose range says something in the plane."""
 
@@ -58,11 +79,18 @@ class HalfPoints:
         self._counts = counts
         self._waiting, self.window = WaitingRoom(), Window()
         self.heights_m: Mapping[int, float] = {}  # of the landmarks of a loaded map
+        self.offsets = RangeOffsets()
         self.mapped_ids = np.empty(0, dtype=np.int64)  # of the landmarks of loaded maps
 
     def clear(self) -> None:
         """Forget the views that wait: time or frame are others."""
         self._waiting, self.window = WaitingRoom(), Window()
+        self.offsets = RangeOffsets()
+
+    @property
+    def open_sides(self) -> list[int]:
+        """Ids of new landmarks whose views fit two places."""
+        return sorted(self._waiting.open_sides)
 
     def levelled(self, event: ObservationEvent) -> ObservationEvent:
         """Return ranges in space as they are in the plane, where landmarks' heights are known."""
@@ -114,8 +142,118 @@ class HalfPoints:
         kinds = np.asarray(event.kinds)
         kinds = np.where(entered, POINT, kinds)
         points = event.points - event.lines_of_sight + lines
-        event = replace(event, points=points, covariances=covariances, kinds=kinds)
-        return event.select(usable)
+        whole = replace(event, points=points, covariances=covariances, kinds=kinds)
+        covariances = self._without_detours(state, whole, rows, event)
+        return replace(whole, covariances=covariances).select(usable)
+
+    def _without_detours(
+        self, state: State, event: ObservationEvent, rows: IntArray, of_shown: ObservationEvent
+    ) -> FloatArray:
+        """Return the covariances (m, 3, 3) of a completed event, larger of ranges too long.
+
+        A range that is long within the gate counts by the probability that it came straight: its
+        variance is divided by that. Beyond the gate it is rejected as any other.
+        """
+        covariances = np.asarray(event.covariances)
+        is_half = np.asarray(of_shown.kinds) != POINT
+        measures = MEASURED[of_axes(of_shown.kinds, state)][:, 0]
+        is_range = is_half & measures & (rows >= 0)
+        S = _expected_covariances(state, event.select(is_range), rows[is_range])
+        if S is None:
+            return covariances
+        shown, lines = of_shown.lines_of_sight[is_range], event.lines_of_sight[is_range]
+        ranges_m = np.linalg.norm(shown, axis=1)
+        expected = expected_lines(state, of_shown.select(is_range), rows[is_range])
+        off_m = ranges_m - np.linalg.norm(expected, axis=1)
+        along = lines / np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-9)
+        own = np.einsum('mi,mij,mj->m', along, covariances[is_range], along)
+        sigmas_m = np.sqrt(np.einsum('mi,mij,mj->m', along, S, along))
+        self.offsets.note(event.ids[is_range], off_m, sigmas_m, np.sqrt(own), state)
+        noise_m = self.offsets.noisier * sigmas_m
+        share = straight_share(off_m / noise_m, straight_odds(noise_m, ranges_m))
+        share[off_m > state.settings.rejection_threshold * sigmas_m] = 1.0
+        more = own * (1.0 / np.maximum(share, LEAST_SHARE) - 1.0)
+        larger: FloatArray = covariances.copy()
+        larger[is_range] += more[:, None, None] * along[:, :, None] * along[:, None, :]
+        return larger
+
+
+class RangeOffsets:
+    """By how much ranges from each landmark are longer than expected, along the way."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, deque[tuple[float, float]]] = {}
+        self._short: deque[float] = deque(maxlen=KEPT)
+        self._last_at = np.full(3, np.inf)
+
+    def note(
+        self,
+        ids: IntArray,
+        off_m: FloatArray,
+        sigmas_m: FloatArray,
+        own_m: FloatArray,
+        state: State,
+    ) -> None:
+        """Note differences (m,), their standard deviations, and the sensor's part of these."""
+        at = state.observer.A[:3, 3]
+        if np.linalg.norm(at - self._last_at) < LEAST_MOVE_M:
+            return  # from one place all have the same error
+        self._last_at = at.copy()
+        for landmark_id, *difference in zip(
+            ids.tolist(), off_m.tolist(), own_m.tolist(), strict=True
+        ):
+            kept = self._of.setdefault(landmark_id, deque(maxlen=KEPT))
+            kept.append((difference[0], difference[1]))
+        self._short.extend((-off_m / sigmas_m)[off_m < 0.0].tolist())
+
+    @property
+    def noisier(self) -> float:
+        """How many times as noisy as stated ranges are: 1 or more, by those that are too short.
+
+        Nothing but noise makes a range too short, so that detours have no part in it.
+        """
+        if len(self._short) < FEWEST:
+            return 1.0
+        return max(float(np.median(self._short)) / MEDIAN_OF_NORMAL, 1.0)
+
+    @property
+    def constant(self) -> dict[int, float]:
+        """Metres by which landmarks' ranges are off everywhere, beyond what all have in common.
+
+        In each quarter of what was seen of them they are so by at least half of it, and by more
+        than a standard deviation of the sensor.
+        """
+        enough = {each: np.array(kept) for each, kept in self._of.items() if len(kept) >= FEWEST}
+        if len(enough) < LEAST_ANCHORS:
+            return {}
+        medians = {each: float(np.median(kept[:, 0])) for each, kept in enough.items()}
+        common = float(np.median(list(medians.values())))
+        biased = {}
+        for each, kept in enough.items():
+            off_m = medians[each] - common
+            quarters = [np.median(part) - common for part in np.array_split(kept[:, 0], 4)]
+            is_constant = min(float(part) / off_m for part in quarters) > 0.5 if off_m else False
+            if is_constant and abs(off_m) > float(np.median(kept[:, 1])):
+                biased[each] = off_m
+        return biased
+
+
+def _expected_covariances(
+    state: State, event: ObservationEvent, rows: IntArray
+) -> FloatArray | None:
+    """Return how far off points of landmarks may be seen (m, 3, 3), body axes, m²; or None."""
+    if not len(rows):
+        return None
+    event, k = calibrated(state, event), state.axes.point
+    residuals = residuals_of(state, event, rows, np.asarray(event.covariances))
+    S = state.gains.innovation_covariance(residuals)
+    if not len(S):
+        return None
+    full = np.zeros((len(rows), 3, 3))
+    full[:, :k, :k] = diagonal_blocks(S, k)
+    R = state.observer.A[:3, :3]
+    turned: FloatArray = R.T @ full @ R
+    return turned
 
 
 def judged(update: Update, event: ObservationEvent, state: State) -> Update:

@@ -174,6 +174,7 @@ class WaitingRoom:
         self._seen: dict[int, int] = {}  # views of each, and …
         self._next: dict[int, int] = {}  # … how many it takes until it is tried again
         self._way = Way()
+        self.open_sides: set[int] = set()  # ids whose views fit two places
 
     def add(
         self, state: State, event: ObservationEvent, row: int, covariance: FloatArray
@@ -195,7 +196,10 @@ class WaitingRoom:
         self._next[landmark_id] = min(math.ceil(TRY_AGAIN * seen), seen + MOST_BETWEEN)
         problem = _PlaceProblem(list(views), self._way.covariance, state.axes.point)
         found = problem.solve(state.settings.range_scale_stddev)
+        self.open_sides.discard(landmark_id)
         if found is None:
+            if problem.side_is_open:
+                self.open_sides.add(landmark_id)
             return None
         for kept in (self._views, self._seen, self._next):
             del kept[landmark_id]
@@ -220,6 +224,7 @@ class _PlaceProblem:
 
     def __init__(self, views: list[WaitingView], walk: FloatArray, k: int) -> None:
         self._k, self._views = k, views
+        self.side_is_open = False  # as the solution has shown
         self._origins = np.array([view.origin for view in views])
         self._lines = np.array([view.line for view in views])
         self._lengths = np.linalg.norm(self._lines, axis=1)
@@ -239,6 +244,7 @@ class _PlaceProblem:
         a little otherwise, which is added to the covariance.
         """
         if self._is_range.any() and not self._curve_decides():
+            self.side_is_open = True
             return None
         solutions = [each for p in self._starts() if (each := self._descend(p)) is not None]
         if not solutions:
@@ -255,6 +261,7 @@ class _PlaceProblem:
             d = (q - p)[: self._k]
             away = d @ np.linalg.solve(C + 1e-4 * np.eye(self._k), d)
             if other_cost < cost + APART and away > 9.0:
+                self.side_is_open = True
                 return None
         e, H, R = self._parts(p)
         lengths = np.where(self._is_range, self._lengths, 0.0)

@@ -20,6 +20,8 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.observer.robust import straight_odds, straight_share
+from slam_observer_ros.runs.health import of_estimate
 from slam_observer_ros.sensor_models.motion_noise import MotionFactors
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -196,3 +198,70 @@ def test_a_bearing_with_a_depth_that_may_be_anything_keeps_its_own_noise():
     event = ObservationEvent(0, np.array([1]), np.array([[10.0, 0.0, 0.0]]), stated[None])
     used = ObservationNoise(SETTINGS).covariances(event)[0]
     assert np.sqrt(used[1, 1]) == pytest.approx(0.0175, rel=0.01)
+
+
+def drive_past_walls(shares, bias_m=0.0, seed=0):
+    """Return a world whose ranges take detours of a metre in the mean, in so many of all."""
+    world = World(replace(SETTINGS, localization_mode='uncertain'), seed=seed)
+    seen, rng = world.seen, np.random.default_rng(seed)
+
+    def seen_past_walls(rows, kinds):
+        for event in seen(rows, kinds):
+            more = (rng.random(len(rows)) < shares) * rng.exponential(1.0, len(rows))
+            more = more + np.where(rows == 2, bias_m, 0.0)
+            lines = event.points * (1.0 + more / np.linalg.norm(event.points, axis=1))[:, None]
+            yield replace(event, points=lines)
+
+    world.seen = seen_past_walls
+    world.drive(100.0, [RANGE], rows=range(N))
+    return world
+
+
+def test_ranges_through_walls_count_less_than_short_ones():
+    off = np.linspace(0.0, 5.0, 50)
+    odds = straight_odds(np.full(50, 0.1), np.full(50, 10.0))
+    share = straight_share(off, odds)
+    assert (straight_share(-off, odds) == 1.0).all()
+    assert (np.diff(share) < 0.0).all()
+    assert share[0] > 0.99 and share[-1] < 0.01
+    # What is one in five of all is never more likely than not where a straight one is right.
+    assert (straight_share(np.zeros(50), odds) > 0.9).all()
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_two_ranges_in_five_through_walls_leave_the_robot_where_it_is(seed):
+    world = drive_past_walls(0.4, seed=seed)
+    assert np.sqrt(np.mean(np.square(world.errors[20:]))) < 0.25
+
+
+@pytest.mark.parametrize('bias_m', [-0.3, 0.3, 1.0])
+def test_an_anchor_whose_ranges_are_off_everywhere_is_named(bias_m):
+    world = drive_past_walls(0.1, bias_m)
+    assert list(world.estimator.anchor_biases) == [2]
+    assert world.estimator.anchor_biases[2] == pytest.approx(bias_m, rel=0.4)
+    findings = [each for each in of_estimate(world.estimator) if each.kind == 'anchor_biased']
+    towards = 'short' if bias_m < 0.0 else 'long'
+    assert len(findings) == 1
+    assert f'landmark 2 are {abs(world.estimator.anchor_biases[2]):.2f} m too {towards}' in str(
+        findings[0].what
+    )
+
+
+@pytest.mark.parametrize('shares', [0.0, 0.2])
+def test_no_anchor_is_named_whose_ranges_are_right_or_long_at_times(shares):
+    assert not drive_past_walls(shares).estimator.anchor_biases
+    alone = np.where(np.arange(N) == 2, 0.3, 0.0)
+    assert not drive_past_walls(alone).estimator.anchor_biases
+
+
+def test_a_straight_way_leaves_the_side_open_and_says_to_drive_a_curve():
+    world = World(SETTINGS, known=False, turn=0.0)
+    world.drive(20.0, [RANGE])
+    assert world.estimator.open_sides == [0, 1, 2, 3]
+    (finding,) = of_estimate(world.estimator)
+    assert finding.kind == 'side_undecided' and finding.remedy == 'drive a curve'
+    world.V[2] = 0.4
+    world.drive(40.0, [RANGE])
+    entered = world.estimator.landmark_ids.tolist()
+    assert entered
+    assert not set(entered) & set(world.estimator.open_sides)
