@@ -1,8 +1,9 @@
 """Ranges alone: Plaza 1 and 2, in a survey of the anchors, without, and lost in it.
 
 ``python benchmark/studies/half_points.py`` prints errors against the truth by the shipped
-``uwb.yaml``, and how many of 100 starts are found on Plaza and in random halls. By how much the ranges, which are 7 % long, are so is not known. The data is not
-shipped: it is read from ``plaza`` in the folder that SLAM_OBSERVER_DATA names.
+``uwb.yaml``, and how many of 100 starts are found on Plaza and in random halls. By how much the
+ranges, which are 7 % long, are so is not known. The data is not shipped: it is read from ``plaza``
+in the folder that SLAM_OBSERVER_DATA names.
 """
 
 from __future__ import annotations
@@ -124,8 +125,9 @@ def lost_in_hall(seed: int, kind: int, in_a_line: bool, walls: float) -> Found:
     anchors = LandmarkMap(
         np.arange(n), points, np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.zeros(n, np.int64)
     )
-    A, scale, turn = pose_of(*rng.uniform(1.0, size - 1.0), rng.uniform(-np.pi, np.pi)), 1.0, 0.0
-    scale += 0.05 * rng.normal()
+    x, y = rng.uniform(1.0, size - 1.0).tolist()
+    A, turn = pose_of(x, y, rng.uniform(-np.pi, np.pi)), 0.0
+    scale = 1.0 + 0.05 * rng.normal()
     events: list[Event] = []
     stamps_ns, poses = [], []
     for step in range(round(MOST_M / SPEED / STEP_S) + 50):

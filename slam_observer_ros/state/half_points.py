@@ -60,9 +60,6 @@ KEPT, FEWEST = 200, 40
 LEAST_ANCHORS = 3
 """Landmarks among which one that is off is known from those that are not."""
 
-MEDIAN_OF_NORMAL = 0.6745
-"""Of what is drawn from a normal distribution, without its sign, in standard deviations."""
-
 LEAST_SHARE = 1e-3
 """Probability of a straight way below which a range says nothing, either way."""
 
@@ -157,7 +154,8 @@ class HalfPoints:
         covariances = np.asarray(event.covariances)
         is_half = np.asarray(of_shown.kinds) != POINT
         measures = MEASURED[of_axes(of_shown.kinds, state)][:, 0]
-        is_range = is_half & measures & (rows >= 0)
+        # Landmarks that ranges have put where they are have the detours of these in them.
+        is_range = is_half & measures & (rows >= 0) & np.isin(event.ids, self.mapped_ids)
         S = _expected_covariances(state, event.select(is_range), rows[is_range])
         if S is None:
             return covariances
@@ -214,7 +212,7 @@ class RangeOffsets:
         """
         if len(self._short) < FEWEST:
             return 1.0
-        return max(float(np.median(self._short)) / MEDIAN_OF_NORMAL, 1.0)
+        return max(math.sqrt(float(np.mean(np.square(self._short)))), 1.0)
 
     @property
     def constant(self) -> dict[int, float]:
