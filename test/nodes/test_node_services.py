@@ -293,6 +293,7 @@ class Publishing:
             calibration=[], motion_factors=[], lyapunov=0.0, stamp_ns=None,
             velocity_is_stale=False, is_localised=True,
             localisation_problem=NO_PLACE, possible_poses=np.empty((0, 4, 4)),
+            ids_at_two_places=[],
         )  # fmt: skip
         vars(self.estimator).update(estimate)
         self.feed = SimpleNamespace(
@@ -312,6 +313,15 @@ class Publishing:
         self.estimator.counts = self.estimator.counts + Counter(new)
         self.diagnostics.publish()
         return self.node.create_publisher().publish.call_args.args[0].status[0]
+
+
+def test_an_id_that_is_there_twice_is_reported_with_what_to_do():
+    figures = dict.fromkeys(('x', 'y', 'z', 'other_x', 'other_y', 'other_z'), 1.0)
+    finding = found('id_at_two_places', id=7, **figures)
+    status = Publishing(ids_at_two_places=[finding]).publish(velocity=1)
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message.startswith('landmark 7 is seen now at')
+    assert finding.remedy in values_of(status).values()
 
 
 @pytest.mark.parametrize(
