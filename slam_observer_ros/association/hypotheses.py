@@ -284,7 +284,8 @@ class Hypotheses:
             if lost is not None:
                 take_back(state, lost)
                 state.counts['slip'] += not was_slipping
-            state.counts.note(Change.CARRIED, np.array(sorted(newly)), event.stamp_ns)
+            if newly:
+                state.counts.note(Change.CARRIED, np.array(sorted(newly)), event.stamp_ns)
         if best.is_mapping:
             for landmark_id in newly:
                 self.forget(landmark_id)
