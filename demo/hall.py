@@ -1,4 +1,4 @@
-"""A hall with AprilTags on its walls, or reflectors, and what a robot measures in it."""
+"""A hall with AprilTags or radios on its walls, or reflectors, and what a robot measures."""
 
 from __future__ import annotations
 
@@ -36,6 +36,17 @@ HALL_M = np.array([180.0, 90.0])  # one reflector in 32 m²
 LAP_SPACE_M = 20.0  # from the middle of the lap to the walls of that hall, at least
 SCAN_RANGE_M, SCAN_SHARE = 15.0, 0.7
 SCAN_NOISE_M, SCAN_NOISE_RAD = 0.02, 0.003
+
+ANCHOR_SPOTS = (
+    (-6.0, -4.0, 2.4), (6.0, -4.0, 2.0), (6.0, 4.0, 2.4), (-6.0, 4.0, 2.0), (0.0, -4.0, 2.6),
+    (-6.0, 1.0, 1.6),
+)  # fmt: skip
+"""Where the radios are, metres: not on both sides of a line that the lap is the same about."""
+
+RANGE_NOISE_M, RANGE_SCALE = 0.1, 1.03
+DETOUR_SHARE, DETOUR_M = 0.2, 1.0
+"""Share of the distances that were measured through a wall, and by how much they are too long, in
+the mean of an exponential distribution."""
 
 TAG_SIZE_M = 0.16
 FOCAL_LENGTH_PX, PIXEL_NOISE_PX = 600.0, 0.5
@@ -92,6 +103,14 @@ def scan(
     left = points[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]  # as long as the range
     noise = SCAN_NOISE_M / ranges_m * along * points + SCAN_NOISE_RAD * across * left
     return np.asarray(points + noise)
+
+
+def ranges(pose: FloatArray, anchors: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Return how far radios (n, 3) seem to be from a receiver at a pose (4, 4): (n,), metres."""
+    ranges_m = RANGE_SCALE * np.linalg.norm(anchors - pose[:3, 3], axis=1)
+    ranges_m += random.normal(0.0, RANGE_NOISE_M, len(anchors))
+    is_long = random.random(len(anchors)) < DETOUR_SHARE
+    return np.asarray(ranges_m + is_long * random.exponential(DETOUR_M, len(anchors)))
 
 
 @dataclass

@@ -18,7 +18,7 @@ from tf2_msgs.msg import TFMessage
 
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import UNKNOWN_ID
+from slam_observer_ros.events import RANGE, UNKNOWN_ID
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.ros_interface import MESSAGES
 
@@ -50,6 +50,10 @@ class World:
     # What is seen at a pose (4, 4) with errors (k, 7): of tags by ids, of points where (m, 3).
     sightings: Sightings | None
     scan: Scan | None = None
+    # Distances (k,) at a pose (4, 4) of all landmarks, which have ids.
+    ranges: Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray] | None = None
+    parameters: tuple[str, ...] = ()  # of the observer, beside those of its file
+    back_within_s: float = 1.0  # after a restart, from enough landmarks in view on
 
 
 @dataclass(frozen=True)
@@ -143,6 +147,7 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         if self._steps % self.world.steps_per_image == 0:
             self._errors.go_on(self.world.steps_per_image / ODOMETRY_HZ)
             count = self._publish_tags(stamp_ns) + self._publish_scan(stamp_ns)
+            count += self._publish_ranges(stamp_ns)
             by_tf = None if self._correction is None else self._correction @ self._odometry.pose
             self.seen.append(Seen(self.time_s, self._truth, by_tf, count))
 
@@ -164,6 +169,18 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
         ids = np.full(len(points), UNKNOWN_ID)
         self._cloud.publish(MESSAGES.point_cloud2(stamp_ns, 'base_link', ids, points))
         return len(points)
+
+    def _publish_ranges(self, stamp_ns: int) -> int:
+        if self.world.ranges is None:
+            return 0
+        ranges_m = self.world.ranges(self._truth, self.world.landmarks, self._random)
+        count = len(ranges_m)
+        points = ranges_m[:, None] * [1.0, 0.0, 0.0]
+        cloud = MESSAGES.point_cloud2(
+            stamp_ns, 'base_link', np.arange(count), points, kinds=np.full(count, RANGE)
+        )
+        self._cloud.publish(cloud)
+        return count
 
     def _publish_tags(self, stamp_ns: int) -> int:
         if self.world.sightings is None:

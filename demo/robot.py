@@ -1,7 +1,7 @@
-"""``make robot``: a simulated robot is localised among tags, reflectors or codes, as for Nav2.
+"""``make robot``: a simulated robot is localised among tags, radios or codes, as for Nav2.
 
-It drives about a hall with AprilTags on its walls, or reflectors in it, or over codes on its
-floor: lost at first, its localisation restarted in the middle, or the robot itself carried
+It drives about a hall with AprilTags or radios on its walls, or reflectors in it, or over codes on
+its floor: lost at first, its localisation restarted in the middle, or the robot itself carried
 elsewhere. Over DDS, the observer is started as
 ``localization.launch.py`` does it.
 """
@@ -51,6 +51,11 @@ START_LIMIT_S = 60.0
 DISCOVERY_S = 1.0
 STOP_LIMIT_S = 10.0
 END_S = 1.0
+RANGE_NOISE_M = 2.0 * hall.RANGE_NOISE_M
+"""As it is stated: short detours pass for noise."""
+
+FOUND_BY_RANGES_S = 20.0
+"""Time of driving by which distances say where the robot is, as it has to turn for that."""
 
 
 class RobotError(SlamObserverError):
@@ -71,6 +76,7 @@ class Observer:
             more += ['-p', 'landmarks_type:=tf']
         if options.keep_pose:
             more += ['-p', f'pose_file:={folder / "pose.yaml"}']
+        more += [word for each in world.parameters for word in ('-p', each)]
         self._command = [
             *(sys.executable, '-m', 'slam_observer_ros.nodes.executables', EXECUTABLE),
             *command_line(world.params_file, arguments),
@@ -107,7 +113,10 @@ class Observer:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Make the run; return 0 if the robot was localised as well as it should be."""
-    options = _parser().parse_args(args)
+    parser = _parser()
+    options = parser.parse_args(args)
+    if options.uwb and options.carried:
+        parser.error('by distances alone a robot does not notice that it was carried')
     console = Console(highlight=False)
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
@@ -143,6 +152,12 @@ def _parser() -> argparse.ArgumentParser:
         '--floor-codes',
         action='store_true',
         help='see codes on the floor, one at a time, by a camera that looks down, in their place',
+    )
+    landmarks.add_argument(
+        '--uwb',
+        action='store_true',
+        help=f'measure the distances of {len(hall.ANCHOR_SPOTS)} radios, all 3 % too long and one '
+        'in five through a wall, in their place',
     )
     parser.add_argument(
         '--carried',
@@ -233,6 +248,18 @@ def world_of(options: argparse.Namespace) -> World:
             camera=floor.CAMERA,
             steps_per_image=2,
             sightings=floor.sightings,
+        )
+    if options.uwb:
+        return replace(
+            tags,
+            kind='radios',
+            enough=len(hall.ANCHOR_SPOTS),
+            params_file='config/uwb.yaml',
+            landmarks=np.array(hall.ANCHOR_SPOTS),
+            sightings=None,
+            ranges=hall.ranges,
+            parameters=(f'range_noise:={RANGE_NOISE_M}',),
+            back_within_s=FOUND_BY_RANGES_S,
         )
     return tags
 

@@ -12,7 +12,7 @@ from slam_observer_ros.cli.console import table_of
 from slam_observer_ros.common.types import FloatArray
 
 MAX_ERROR_M, MAX_ERROR_RAD = 0.15, 0.08  # of the RMS; with the noise of the hall it is a third
-MAX_BACK_S, MAX_NOTICED_S = 1.0, 10.0  # a robot that was carried has to notice that first
+MAX_NOTICED_S = 10.0  # a robot that was carried has to notice that first
 FOUND_M = 0.5  # from there on it is where it was put
 MIN_RATE = 0.9  # of what is asked for; less says something of the machine alone
 
@@ -112,7 +112,7 @@ def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console
         position_m < MAX_ERROR_M
         and heading_rad < MAX_ERROR_RAD
         and back_s is not None
-        and back_s <= (MAX_NOTICED_S if interruption.is_carried else MAX_BACK_S)
+        and back_s <= (MAX_NOTICED_S if interruption.is_carried else robot.world.back_within_s)
     )
     if reached_hz < MIN_RATE * rate_hz:
         console.print('The machine is too slow for this: try a smaller --real-time-factor.')

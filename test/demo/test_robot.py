@@ -35,6 +35,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
         ['--reflectors', '--carried'],
         ['--floor-codes'],
         ['--floor-codes', '--carried'],
+        ['--uwb'],
     ],
     ids=' '.join,
 )
@@ -42,8 +43,9 @@ def test_the_robot_is_localised_before_and_after_what_happens_half_way(
     monkeypatch, capsys, options
 ):
     monkeypatch.chdir(CHECKOUT)
+    duration = '30' if '--uwb' in options else '14'  # by distances a robot is found as it turns
     for factor in ('1', '0.5', '0.25'):
-        exit_code = robot.main(['--duration', '14', '--real-time-factor', factor, *options])
+        exit_code = robot.main(['--duration', duration, '--real-time-factor', factor, *options])
         output = capsys.readouterr().out
         if 'too slow' not in output:  # else what it says is done: other tests run beside this one
             break
@@ -122,6 +124,17 @@ def test_among_reflectors_the_shipped_file_is_as_sure_as_it_may_be():
                 P = P[np.ix_([3, 4, 2], [3, 4, 2])]
                 nees.append(error @ np.linalg.solve(P, error) / 3.0)
     assert 0.4 < np.mean(nees) < 2.0
+
+
+def test_distances_are_3_percent_long_and_one_in_five_is_through_a_wall():
+    random = np.random.default_rng(0)
+    anchors = np.array(hall.ANCHOR_SPOTS)
+    pose = hall.true_pose(5.0)
+    true_m = np.linalg.norm(anchors - pose[:3, 3], axis=1)
+    off_m = np.array([hall.ranges(pose, anchors, random) for _ in range(2000)]) - 1.03 * true_m
+    assert abs(np.median(off_m)) < 0.06
+    assert 0.1 < np.mean(off_m > 4.0 * hall.RANGE_NOISE_M) < 0.2
+    assert np.mean(off_m < -4.0 * hall.RANGE_NOISE_M) < 1e-3
 
 
 def test_wheels_drift_from_the_truth():
