@@ -88,7 +88,9 @@ class HeardTopic:
         needed = ' '.join(part for part in (remapping, setting and f'-p {setting}') if part)
         rate = f'{self.rate_hz:.1f} Hz' if self.messages else 'no message'
         found = [self.type_name, rate, self.problem or self._content()]
-        found.append(f'as {role}' + (f' with {needed}' if needed else ''))
+        known = _read_types().get(self.type_name)
+        doubt = ', if they are landmarks' if known is not None and known.is_ambiguous else ''
+        found.append(f'as {role}' + (f' with {needed}' if needed else '') + doubt)
         return ', '.join(part for part in found if part)
 
     def _content(self) -> str:
@@ -105,7 +107,8 @@ class HeardTopic:
         if not isinstance(event, ObservationEvent):
             return frame
         named = int(np.count_nonzero(event.ids != UNKNOWN_ID))
-        return f'{len(event.ids)} points, {named} with an id, {frame}'
+        by = ' by the CameraInfo on camera_info' if event.pixels is not None else ''
+        return f'{len(event.ids)} points, {named} with an id, {frame}{by}'
 
 
 def main() -> int:

@@ -87,6 +87,29 @@ def directions(seen):
     return message
 
 
+def distances(seen):
+    """Of float32, as LinkTrack has them."""
+    return np.linalg.norm(seen.points, axis=1).astype(np.float32)
+
+
+def range_cloud(seen):
+    records = np.zeros((1, len(seen.ids)), dtype=[('range', '<f4'), ('id', '<i4')])
+    records['range'], records['id'] = distances(seen), seen.ids
+    message = ros.point_cloud2(records, CAMERA_FRAME)
+    message.header = ros.header(CAMERA_FRAME, seen.stamp_ns)
+    return message
+
+
+def linktrack(seen):
+    nodes = zip(seen.ids.tolist(), distances(seen).tolist(), strict=True)
+    return detector.linktrack('LinktrackNodeframe3', nodes, CAMERA_FRAME, seen.stamp_ns)
+
+
+def range_beacon(seen):
+    sensed = zip(seen.ids.tolist(), distances(seen).tolist(), strict=True)
+    return detector.range_beacon(sensed, CAMERA_FRAME, seen.stamp_ns)
+
+
 def boxes_in_image(seen):
     names = (f'lamp_{number}' for number in seen.ids)
     found = zip(names, detector.pixels_of(seen.points), strict=True)
@@ -134,6 +157,9 @@ MESSAGES = {
     '/landmark_list': landmark_list,
     '/range_bearing': range_bearing,
     '/directions': directions,
+    '/range_cloud': range_cloud,
+    '/linktrack': linktrack,
+    '/range_beacon': range_beacon,
     '/boxes_in_image': boxes_in_image,
     '/tags_in_image': tags_in_image,
     '/camera_info': lambda _seen: detector.camera_info(CAMERA_FRAME),
@@ -185,6 +211,9 @@ def recordings(tmp_path_factory):
         'two': ['/detections', '/boxes'],
         'unplaced': ['/detections'],
         'directions': ['/directions'],
+        'range cloud': ['/range_cloud'],
+        'linktrack': ['/linktrack'],
+        'range beacon': ['/range_beacon'],
         'boxes in images': ['/boxes_in_image', '/camera_info'],
         'tags in images': ['/tags_in_image', '/camera_info'],
         'no camera': ['/boxes_in_image'],
@@ -243,14 +272,24 @@ def test_detections_with_ids_replay_like_a_cloud(recordings, estimate, name, opt
     assert_same(estimate(recordings[name], *options), estimate(recordings['all']))
 
 
-@pytest.mark.parametrize('name', ['boxes in images', 'tags in images'])
-def test_pixels_replay_like_directions(recordings, slam_observer, estimate, tmp_path, name):
-    """In a map, by the CameraInfo that was recorded."""
+@pytest.mark.parametrize(
+    ('name', 'like'),
+    [
+        ('boxes in images', 'directions'),
+        ('tags in images', 'directions'),
+        ('linktrack', 'range cloud'),
+        ('range beacon', 'range cloud'),
+    ],
+)
+def test_what_a_driver_says_of_half_points_replays_like_a_cloud_of_them(
+    recordings, slam_observer, estimate, tmp_path, name, like
+):
+    """In a map; pixels by the CameraInfo that was recorded."""
     known = tmp_path / 'known.yaml'
     slam_observer.succeed('replay', recordings['all'], '--map', known)
     options = ('--load-map', known, '--set', 'set_initial_pose=true')
     actual = estimate(recordings[name], *options)
-    assert_same(actual, estimate(recordings['directions'], *options))
+    assert_same(actual, estimate(recordings[like], *options))
 
 
 def test_pixels_of_a_camera_that_nobody_knows_are_dropped_and_reported(recordings, slam_observer):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import detector_messages as detector
 from node_processes import running
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
+import ros_messages
 from tf2_msgs.msg import TFMessage
 
 from slam_observer_ros.messages.poses import TRANSFORMS
@@ -47,6 +49,15 @@ def test_fiducials_on_tf_are_told_from_the_rest_of_it():
         f'{TRANSFORMS}, 2.0 Hz, 2 fiducials, as landmarks with -p landmarks_type:=tf, as /tf'
     )
     assert HeardTopic('/tf_static', TRANSFORMS, 3.0).text().endswith('as /tf_static')
+
+
+def test_a_range_may_be_of_a_landmark_and_pixels_need_the_camera():
+    sonar = HeardTopic('/sonar', 'sensor_msgs/msg/Range', heard_s=1.0)
+    sonar.take(ros_messages.serialise(detector.one_range('sonar_front', 2.0)))
+    assert sonar.text().endswith('as landmarks with -r landmarks:=/sonar, if they are landmarks')
+    boxes = HeardTopic('/landmarks', 'vision_msgs/msg/Detection2DArray', heard_s=1.0)
+    boxes.take(ros_messages.serialise(detector.boxes([('lamp_5', (1.0, 2.0))], 'cam')))
+    assert "in 'cam' by the CameraInfo on camera_info, as landmarks" in boxes.text()
 
 
 def test_it_says_that_nothing_is_heard(slam_observer):
