@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from importlib import metadata
 from importlib.util import find_spec
 from itertools import islice
@@ -20,7 +21,9 @@ from slam_observer_ros.cli.console import print_json, print_table
 from slam_observer_ros.cli.options import find_config, named_path
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AZIMUTH_RANGE,
     Event,
@@ -30,11 +33,13 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_maps
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.observer import core
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.health import of_half_points
 from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import message_types
@@ -92,7 +97,9 @@ def run(args: argparse.Namespace) -> None:
     if args.recording is not None:
         maps = None if args.load_map is None else read_maps(args.load_map)
         name, why, events = fitting_file(args.recording)
-        findings = mistakes(_shipped_settings(name), events, maps)
+        findings = mistakes(shipped_settings(name), events, maps)
+        if maps is not None:
+            findings += of_anchors(shipped_settings(name), events, maps)
         if args.json:
             print_json(
                 {
@@ -199,11 +206,28 @@ FAR_SHARE = 0.25
 """Share of the points that are so far where a laser scanner sees them."""
 
 
-def _shipped_settings(name: str) -> Settings:
+def shipped_settings(name: str) -> Settings:
     """Return what a shipped parameter file says of the estimator."""
     known = {row.name for row in table(Settings)}
     values = read_parameter_file(find_config(name)).items()
     return from_parameters(Settings, {key: value for key, value in values if key in known})
+
+
+def of_anchors(
+    settings: Settings, events: Sequence[Event], maps: Sequence[LandmarkMap]
+) -> list[Finding]:
+    """Name anchors whose ranges are off everywhere; the robot is found without a pose first."""
+    if all(not isinstance(e, ObservationEvent) or e.kinds is None for e in events):
+        return []
+    estimator = Estimator(settings)
+    estimator.load_map(maps)
+    for event in events:
+        estimator.add(event)
+    estimator.flush()
+    problem = estimator.localisation_problem
+    if problem is not None:
+        return [problem]
+    return of_half_points(estimator.anchor_biases, [])
 
 
 def fitting_file(path: Path) -> tuple[str, str, list[Event]]:

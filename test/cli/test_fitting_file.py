@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from slam_observer_ros.cli.doctor import of_anchors, shipped_settings
 from slam_observer_ros.cli.main import main
 from slam_observer_ros.events import (
     BEARING,
@@ -15,6 +16,8 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.writer import RecordingWriter
 
 STEP_NS = 50_000_000
@@ -129,3 +132,33 @@ def test_a_graph_comes_with_parameters_that_replay_takes(tmp_path, capsys):
     assert main(['convert', 'graph', str(graph), str(out)]) == 2
     assert parameters.read_text(encoding='utf-8') == 'mine'
     assert not out.exists()
+
+
+def drive_among(anchors, bias_m):
+    """Return a drive among anchors (n, 3), of which the ranges of the third are off."""
+    rng, A, events = np.random.default_rng(0), np.eye(4), []
+    V = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
+    for step in range(1500):
+        stamp_ns = 100_000_000 * step
+        events.append(VelocityEvent(stamp_ns, V))
+        if step % 4 == 0:
+            lines = se3.transform(se3.inverse(A), anchors)
+            ranges_m = np.linalg.norm(lines, axis=1, keepdims=True)
+            ranges_m += 0.1 * rng.normal(size=ranges_m.shape)
+            ranges_m[2] += bias_m
+            ids, kinds = np.arange(len(anchors)), np.full(len(anchors), RANGE)
+            shown = ranges_m * [1.0, 0.0, 0.0]
+            events.append(ObservationEvent(stamp_ns, ids, shown, kinds=kinds))
+        A = A @ se3.exp(0.1 * V)
+    return events
+
+
+@pytest.mark.parametrize('bias_m', [0.0, 1.5])
+def test_an_anchor_that_is_off_is_named_by_the_map_alone(bias_m):
+    anchors = np.random.default_rng(1).uniform(-12.0, 12.0, (6, 3)) * [1.0, 1.0, 0.0]
+    covariances = np.tile(1e-4 * np.eye(3), (6, 1, 1))
+    survey = LandmarkMap(np.arange(6), anchors, covariances, np.zeros(6, np.int64))
+    events = drive_among(anchors, bias_m)
+    findings = of_anchors(shipped_settings('uwb'), events, [survey])
+    assert [each.kind for each in findings] == (['anchor_biased'] if bias_m else [])
+    assert all('landmark 2 are' in each.what for each in findings)
