@@ -255,6 +255,21 @@ class MotionFactor:
 
 
 @dataclass(frozen=True, slots=True)
+class Ambiguity:
+    """A time in which what was seen without ids fitted several maps, of which one was shown."""
+
+    since_ns: int  # stamps of the first observation after which it was so, and of the last one
+    until_ns: int
+    position: FloatArray  # (3,) where the robot was shown at its beginning, metres, world
+    probability: float  # least one, meanwhile, that the map shown was right
+
+    @property
+    def lasts_ns(self) -> int:
+        """How long it has lasted, nanoseconds."""
+        return self.until_ns - self.since_ns
+
+
+@dataclass(frozen=True, slots=True)
 class RangePower:
     """The power of the cosine off its axis with which a sensor's ranges grow: 1 for depths."""
 

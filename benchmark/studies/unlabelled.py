@@ -32,7 +32,7 @@ from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.runs.health import of_estimate, of_rejections
+from slam_observer_ros.runs.health import of_estimate, of_map_without_ids, of_rejections
 
 NEES_EVERY = 10
 """Observations from one covariance of the configuration to the next: these cost O(n³)."""
@@ -52,7 +52,7 @@ WRONG_ANEES, WRONG_COUNT = 3.0, 2
 many landmarks too many.
 """
 
-SAYS_SO = ('unexpected_place', 'doubled_landmark')
+SAYS_SO = ('ambiguous_map', 'unconfirmed_map', 'unexpected_place', 'doubled_landmark')
 """Findings that say that a map without ids may be wrong."""
 
 
@@ -164,7 +164,9 @@ def _print_kind(kind: str, rows: Sequence[Compared]) -> None:
     ratios = np.array([row.ratio for row in rows])
     wrong, right = [r for r in rows if r.is_wrong], [r for r in rows if not r.is_wrong]
     sys.stdout.write(
-        f'| {kind} | {len(rows)} | {np.median(ratios):.2f} | {np.percentile(ratios, 90):.2f} | '
+        f'| {kind} | {len(rows)} | {np.median(ratios):.2f} | '
+        f'{np.percentile(ratios, 90, method="higher"):.2f} | '
+        f''
         f'{ratios.max():.2f} | {np.mean(ratios > 1.5):.0%} | {sum(r.too_many for r in rows)} | '
         f'{sum(r.too_few for r in rows)} | {sum(not r.anees <= WRONG_ANEES for r in rows)} | '
         f'{len(wrong)} | {sum(not r.says_so for r in wrong)} | '
@@ -269,6 +271,7 @@ def _findings(estimator: Estimator) -> Iterator[Finding]:
     """Yield what node and replay say of an estimate."""
     yield from of_estimate(estimator)
     yield from of_rejections(estimator.counts)
+    yield from of_map_without_ids(estimator, estimator.longest_ambiguity)
     yield from (found(kind) for kind in UNEXPECTED_POSES if estimator.counts[kind])
 
 

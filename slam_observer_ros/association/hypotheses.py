@@ -33,6 +33,7 @@ from slam_observer_ros.association.joint_compatibility import (
 from slam_observer_ros.association.standing import MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import (
+    Ambiguity,
     CalibrationEstimate,
     Change,
     DELAY_NAME,
@@ -43,10 +44,11 @@ from slam_observer_ros.estimates import (
 )
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import mahalanobis, transpose
+from slam_observer_ros.geometry.matrices import cholesky, mahalanobis, transpose
 from slam_observer_ros.sensor_models.integration import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import in_parts, usual
+from slam_observer_ros.state.covariances import of_pose
 from slam_observer_ros.state.matching import calibrated, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import step
@@ -55,6 +57,18 @@ MOST_WITHOUT_IDS = 2
 """Hypotheses that are followed at most where points have no ids: each costs as much as the first,
 and a third one is hardly ever the right one.
 """
+
+
+AMBIGUOUS = 4.0
+"""Deviation of the pose by all hypotheses, over what the best one states, in any direction, from
+which on they are several maps and not one.
+"""
+
+AMBIGUOUS_NS = 5_000_000_000
+"""How long that has to last, nanoseconds: what the next views decide is no news."""
+
+LEAST_DEVIATION = 0.01
+"""Deviation of a pose, rad and m, within which poses are the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +103,18 @@ class Hypotheses:
         self._standing = Standing()
         self._velocities: VelocityHistory | None = None  # along which they were moved
         self._delay_evidence = DelayEvidence()
+        self._present: Ambiguity | None = None
+        self._longest: Ambiguity | None = None
+
+    @property
+    def ambiguity(self) -> Ambiguity | None:
+        """Since when what is seen fits several maps; None if it does not, or only for a moment."""
+        return _lasting(self._present)
+
+    @property
+    def longest_ambiguity(self) -> Ambiguity | None:
+        """The longest time in which it did, since the start."""
+        return _lasting(self._longest)
 
     @property
     def counts(self) -> Counter[str]:
@@ -241,6 +267,7 @@ class Hypotheses:
 
     def clear_time(self) -> None:
         """Let all hypotheses go on from where they are at any other time."""
+        self._present = None
         for hypothesis in self._all:
             hypothesis.state.clear_time()
         self._standing.clear_time()
@@ -269,7 +296,40 @@ class Hypotheses:
             carried = whole.ids[~np.isin(whole.ids, event.ids)]
             for hypothesis in self._all:
                 hypothesis.state.counts.note(Reason.CARRIED, carried, event.stamp_ns)
-        return self._observe(event)
+        update = self._observe(event)
+        self._note_ambiguity(event)
+        return update
+
+    def _note_ambiguity(self, event: ObservationEvent) -> None:
+        """Note whether points without ids fit several maps, after an observation."""
+        are_several = len(self._all) > 1 and bool((event.ids == UNKNOWN_ID).any())
+        if not are_several or self._disagreement() <= AMBIGUOUS:
+            self._present = None
+            return
+        stamp_ns, probability = event.stamp_ns, float(self.weights[0])
+        present = self._present
+        if present is None:
+            position = self.best.observer.pose[:3, 3].copy()
+            present = Ambiguity(stamp_ns, stamp_ns, position, probability)
+        probability = min(present.probability, probability)
+        self._present = present = replace(present, until_ns=stamp_ns, probability=probability)
+        if self._longest is None or present.lasts_ns > self._longest.lasts_ns:
+            self._longest = present
+
+    def _disagreement(self) -> float:
+        """Return the pose's deviation by all hypotheses over that by the best one, at most."""
+        of_each: list[tuple[FloatArray, FloatArray | None]] = []
+        for hypothesis in self._all:
+            observer, errors = hypothesis.state.observer, hypothesis.state.known_errors
+            covariance = of_pose(observer, errors.pose_covariance(), observer.A)
+            of_each.append((observer.pose, covariance))
+        own, mixed = of_each[0][1], self._mixed(of_each)
+        if own is None or mixed is None:
+            return 0.0
+        pose, least = self.best.axes.pose, LEAST_DEVIATION**2
+        L = np.linalg.inv(cholesky(own[pose, pose] + least * np.eye(self.best.axes.p)))
+        spread = L @ (mixed[pose, pose] + least * np.eye(self.best.axes.p)) @ L.T
+        return float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
 
     def _judge(self, event: ObservationEvent) -> None:
         """Stop where the wheels spin, and give up landmarks that the robot carries."""
@@ -403,6 +463,11 @@ class Hypotheses:
             ids = hypothesis.state.landmarks.ids
             self._next_id = max(self._next_id, int(np.max(ids[is_automatic(ids)], initial=0)) + 1)
         return self._next_id + np.arange(m)
+
+
+def _lasting(ambiguity: Ambiguity | None) -> Ambiguity | None:
+    lasts = ambiguity is not None and ambiguity.lasts_ns >= AMBIGUOUS_NS
+    return ambiguity if lasts else None
 
 
 def _are_one(child: _Child, other: _Child) -> bool:

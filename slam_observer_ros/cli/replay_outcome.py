@@ -33,6 +33,7 @@ from slam_observer_ros.runs.health import (
     of_fit,
     of_left_out,
     of_map,
+    of_map_without_ids,
     of_ranges,
     of_rejections,
 )
@@ -232,6 +233,7 @@ def _of_run(outcome: ReplayOutcome) -> Iterator[Finding]:
     # What ranges are taken for comes first: where that is wrong, noise makes up for it.
     yield from of_ranges(result.range_power, estimator.settings.range_is_depth)
     yield from of_estimate(estimator)
+    yield from _of_map_without_ids(result)
     nis = None if outcome.recorder is None else outcome.recorder.mean_nis
     yield from of_fit(None if nis is None else math.sqrt(nis))
     if result.in_known_map and estimator.settings.localization_mode != 'off':
@@ -241,6 +243,16 @@ def _of_run(outcome: ReplayOutcome) -> Iterator[Finding]:
     for name in UNEXPECTED_POSES:
         if counts[name]:
             yield replace(found(name), level=Level.NOTE)
+
+
+def _of_map_without_ids(result: Replay) -> Iterator[Finding]:
+    ambiguity = result.estimator.longest_ambiguity
+    for finding in of_map_without_ids(result.estimator, ambiguity):
+        if ambiguity is not None and finding.kind == 'ambiguous_map':
+            start_s, end_s = map(result.seconds_until, (ambiguity.since_ns, ambiguity.until_ns))
+            yield replace(finding, start_s=start_s, end_s=end_s)
+        else:
+            yield finding
 
 
 def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:

@@ -384,6 +384,18 @@ KINDS = {
         'was moved, or it is in the map twice now',
         'if it was not moved, state more noise of the velocity or of the points (Tune the noise)',
     ),
+    'ambiguous_map': Kind(
+        Level.WARNING,
+        'what is seen without ids fits several maps for {lasts_s:.0f} s, from ({x:.1f} m, '
+        '{y:.1f} m) on: the one that is shown is right with a probability of {probability:.2f}',
+        'drive to where more known landmarks are in view, or give some of them ids',
+    ),
+    'unconfirmed_map': Kind(
+        Level.WARNING,
+        '{waiting} landmarks without ids were seen fewer than {times} times (min_support), and '
+        'only {known} are in the map',
+        'drive more slowly, see them more often, or set min_support lower if few points are false',
+    ),
     'wrong_pose': Kind(
         Level.WARNING, 'the pose in the map is wrong: {reason}; localising again', GIVE_THE_POSE
     ),

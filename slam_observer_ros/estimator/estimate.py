@@ -11,6 +11,7 @@ from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import (
+    Ambiguity,
     CalibrationEstimate,
     MotionFactor,
     Outcome,
@@ -82,6 +83,21 @@ class Estimate:
         Behaviour is then not to rely on it, however small its covariance is.
         """
         return self._localiser.is_contradicted
+
+    @property
+    def ambiguity(self) -> Ambiguity | None:
+        """Since when what is seen without ids fits several maps; None if it fits one."""
+        return self._hypotheses.ambiguity
+
+    @property
+    def longest_ambiguity(self) -> Ambiguity | None:
+        """The longest time in which it fitted several; None if it never did for long."""
+        return self._hypotheses.longest_ambiguity
+
+    @property
+    def waiting_landmarks(self) -> int:
+        """How many landmarks without an id are yet to be seen often enough to be in the map."""
+        return int(np.count_nonzero(self._state.landmarks.tentative))
 
     @property
     def is_localised(self) -> bool:

@@ -13,8 +13,10 @@ import math
 from typing import Any, Protocol
 
 from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.estimates import (
+    Ambiguity,
     CalibrationEstimate,
     DELAY_NAME,
     most_frequent,
@@ -26,6 +28,7 @@ from slam_observer_ros.estimates import (
 )
 from slam_observer_ros.geometry.matrices import MAX_DEVIATION
 from slam_observer_ros.messages.outgoing import OutgoingMessages
+from slam_observer_ros.settings.estimator_settings import Settings
 
 MAX_REJECTED = 0.1
 """Share of the points beyond which they are more than a sensor's outliers."""
@@ -59,6 +62,9 @@ NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
 SHOWN, SURE = 0.25, 4.0
 """Power of the cosine in ranges, over that of what they are taken for, that is worth a finding,
 and by how many of its deviations."""
+
+HARDLY_ANY = 0.25
+"""Landmarks in a map, over those seen too seldom for it, below which there is hardly a map."""
 
 IMPLAUSIBLE = 4.0
 """Stated standard deviations by which no calibration is off: something else is wrong."""
@@ -105,6 +111,12 @@ class Diagnosed(Protocol):
     def dropped(self) -> Counter[str]: ...  # noqa: D102
     @property
     def landmark_ids(self) -> IntArray: ...  # noqa: D102
+    @property
+    def settings(self) -> Settings: ...  # noqa: D102
+    @property
+    def ambiguity(self) -> Ambiguity | None: ...  # noqa: D102
+    @property
+    def waiting_landmarks(self) -> int: ...  # noqa: D102
     @property
     def calibration(self) -> Sequence[CalibrationEstimate]: ...  # noqa: D102
     @property
@@ -171,6 +183,21 @@ def of_half_points(biases: Mapping[int, float], open_sides: Sequence[int]) -> li
         return biased
     ids = ', '.join(str(landmark_id) for landmark_id in open_sides)
     return [*biased, found('side_undecided', ids=ids)]
+
+
+def of_map_without_ids(estimator: Diagnosed, ambiguity: Ambiguity | None) -> list[Finding]:
+    """Judge whether what was seen without ids makes one map, and makes one at all."""
+    findings, known, waiting = [], len(estimator.landmark_ids), estimator.waiting_landmarks
+    if ambiguity is not None:
+        x, y, _ = ambiguity.position
+        lasts_s, probability = to_s(ambiguity.lasts_ns), ambiguity.probability
+        findings.append(found('ambiguous_map', lasts_s=lasts_s, x=x, y=y, probability=probability))
+    # After twice as many observations as one landmark takes.
+    times = estimator.settings.min_support
+    is_begun = estimator.counts['observation'] >= 2 * times
+    if is_begun and known < HARDLY_ANY * waiting:
+        findings.append(found('unconfirmed_map', waiting=waiting, times=times, known=known))
+    return findings
 
 
 def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
@@ -333,6 +360,7 @@ def diagnostics(
 ) -> Any:
     """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
     findings = of_velocity(estimator) + of_estimate(estimator)
+    findings += of_map_without_ids(estimator, estimator.ambiguity)
     problems = worst_first(findings, [])
     values = estimator_values(estimator, estimator.dropped, findings)
     status = messages.make(

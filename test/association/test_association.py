@@ -32,6 +32,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.data_sets import load_mrclam
+from slam_observer_ros.runs.health import of_map_without_ids
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
@@ -181,6 +182,54 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     assert np.sqrt(estimator.pose_covariance[2, 2]) < 0.2 * in_doubt_rad
     assert_array_equal(estimator.landmark_ids, known)
     assert_allclose(estimator.world_points, posts, atol=0.1)
+
+
+def test_it_says_since_when_and_where_what_is_seen_fits_several_maps():
+    """Of two posts 3 m apart one is in view for ten seconds, then a third landmark decides."""
+    settings = replace(PLANAR, angular_velocity_noise=(0.0, 0.0, 0.1), confirmations=1)
+    posts = np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 6.0, 0.0]])
+    estimator = Estimator(settings)
+    for step in range(20):
+        stand(estimator, 0.1 * step)
+        observe(estimator, 0.1 * step, posts)
+    for step in range(20, 100):
+        creep(estimator, 0.1 * step)
+    seen = se3.transform(se3.inverse(se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0]))), posts)
+    for step in range(10, 14):
+        stand(estimator, float(step))
+        observe(estimator, float(step), seen[1:2])
+    assert estimator.ambiguity is None, 'the next view may decide it'
+    for step in range(14, 20):
+        stand(estimator, float(step))
+        observe(estimator, float(step), seen[1:2])
+    ambiguity = estimator.ambiguity
+    assert ambiguity is not None
+    assert 5 * 10**9 <= ambiguity.lasts_ns <= 10**10
+    assert 0.0 < ambiguity.probability < 0.95
+    (finding,) = of_map_without_ids(estimator, ambiguity)
+    assert finding.kind == 'ambiguous_map'
+    assert f'for {ambiguity.lasts_ns * 1e-9:.0f} s, from (0.0 m, ' in finding.what
+    for step in range(20, 26):
+        stand(estimator, float(step))
+        observe(estimator, float(step), seen[1:])
+    assert estimator.ambiguity is None
+    assert estimator.longest_ambiguity == ambiguity
+
+
+def test_it_says_that_landmarks_are_seen_too_seldom_for_a_map():
+    """A new one in each view, as from a camera that takes one image in a while."""
+    estimator = Estimator(PLANAR)
+    for step in range(12):
+        creep(estimator, float(step))
+        observe(estimator, float(step), np.array([[3.0, 4.0 * step, 0.0]]))
+    (finding,) = of_map_without_ids(estimator, None)
+    assert finding.kind == 'unconfirmed_map'
+    assert 'only 0 are in the map' in finding.what
+    for step in range(12, 60):
+        stand(estimator, float(step))
+        observe(estimator, float(step), np.array([[3.0, 44.0, 0.0], [3.0, 40.0, 0.0]]))
+    assert len(estimator.landmark_ids) == 2
+    assert not of_map_without_ids(estimator, None)
 
 
 def test_of_two_places_the_one_is_given_up_where_more_should_have_been_seen():

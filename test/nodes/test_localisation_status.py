@@ -34,12 +34,14 @@ class Watched:
         deviations=(0.0,) * 6,
         noise=None,
         is_contradicted=False,
+        is_ambiguous=False,
     ):
         self.estimator = SimpleNamespace(
             is_localised=is_localised,
             is_contradicted=is_contradicted,
             stamp_ns=stamp_ns,
-            map_name='',
+            map_name='hall' if is_ambiguous else '',
+            ambiguity=object() if is_ambiguous else None,
             pose_covariance=None if deviations is None else np.diag(deviations) ** 2,
         )
         self.node = Mock()
@@ -67,6 +69,12 @@ class Watched:
             ERROR,
             'the pose in the map is wrong, or the landmarks in view were moved: all of them are '
             'rejected',
+            False,
+        ),
+        (
+            {'is_ambiguous': True},
+            ERROR,
+            'what is seen fits several places of the map',
             False,
         ),
         ({'deviations': None}, OK, 'localised; the gains know no standard deviation', True),

@@ -33,6 +33,7 @@ from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher, MANY_UNUSED
 from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.runs.health import of_calibration
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros
@@ -291,7 +292,8 @@ class Publishing:
         self.estimator = SimpleNamespace(
             counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
             calibration=[], motion_factors=[], lyapunov=0.0, stamp_ns=None,
-            velocity_is_stale=False, is_localised=True,
+            velocity_is_stale=False, is_localised=True, ambiguity=None, waiting_landmarks=0,
+            settings=Settings(),
             localisation_problem=NO_PLACE, possible_poses=np.empty((0, 4, 4)),
             ids_at_two_places=[],
         )  # fmt: skip

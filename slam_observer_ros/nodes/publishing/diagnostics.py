@@ -23,6 +23,7 @@ from slam_observer_ros.runs.health import (
     estimator_values,
     of_estimate,
     of_left_out,
+    of_map_without_ids,
     of_rejections,
     of_stamps,
     of_velocity,
@@ -174,6 +175,7 @@ class DiagnosticsPublisher:
         if recent['observed_point'] >= MIN_POINTS:
             findings += of_rejections(recent, 'seen lately ')
         findings += of_velocity(self._estimator) + of_estimate(self._estimator)
+        findings += of_map_without_ids(self._estimator, self._estimator.ambiguity)
         return findings
 
     def _faults(self) -> list[str]:

@@ -131,6 +131,11 @@ class LocalisationStatus:
             return DiagnosticStatus.ERROR, 'the pose in the loaded map is not known'
         if estimator.is_contradicted:
             return DiagnosticStatus.ERROR, found('contradicted_pose').what
+        if estimator.map_name and estimator.ambiguity is not None:
+            return (
+                DiagnosticStatus.ERROR,
+                'what is seen fits several places of the map',
+            )
         if deviations is None:
             return DiagnosticStatus.OK, 'localised; the gains know no standard deviation'
         position_m, heading_rad = deviations
