@@ -16,7 +16,9 @@ from robot_report import Interruption
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.nodes.ros_interface import TFMessage
+from slam_observer_ros.runs.health import of_mounting
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
@@ -97,32 +99,60 @@ def test_a_scan_is_of_reflectors_near_the_robot_within_its_noise():
         assert off_m.max() < 0.3
 
 
-def test_among_reflectors_the_shipped_file_is_as_sure_as_it_may_be():
-    """Or its noise, or that of the hall, would be misstated."""
-    names = {row.name for row in table(Settings)}
-    given = read_parameter_file(CHECKOUT / 'config' / 'reflectors.yaml')
-    settings = from_parameters(Settings, {k: v for k, v in given.items() if k in names})
-    nees = []
-    for seed in range(2):
-        random = np.random.default_rng(seed)
-        world = robot.world_of(SimpleNamespace(reflectors=True, seed=seed))
-        points, estimator = world.landmarks, Estimator(settings)
-        estimator.load_map(robot.surveyed(world, seed))
-        odometry, errors = hall.WheelOdometry(random), hall.SightErrors(random, len(points))
-        for step in range(1, 250):
+class Drive:
+    """A lap of the robot at ten images a second, without ROS, by a shipped parameter file."""
+
+    def __init__(self, file, seed=0, mount=None, **changes):
+        names = {row.name for row in table(Settings)}
+        given = read_parameter_file(CHECKOUT / 'config' / f'{file}.yaml')
+        chosen = {key: value for key, value in given.items() if key in names}
+        others = {'floor_codes': False, 'uwb': False}
+        options = SimpleNamespace(reflectors=file == 'reflectors', seed=seed, **others)
+        self.world = robot.world_of(options)
+        self.estimator = Estimator(from_parameters(Settings, chosen | changes))
+        self.mount = np.eye(4) if mount is None else mount
+        self.random = np.random.default_rng(seed)
+
+    def run(self, seconds):
+        """Go on; return errors (n, 3), and their normalised squares, once a second."""
+        estimator, world, random, off = self.estimator, self.world, self.random, []
+        odometry = hall.WheelOdometry(random)
+        errors = hall.SightErrors(random, len(world.landmarks))
+        for step in range(1, 10 * seconds):
             before, truth = hall.true_pose((step - 1) / 10.0), hall.true_pose(step / 10.0)
             odometry.advance(before, truth, 0.1)
             V = np.array([0.0, 0.0, odometry.turn_rad_s, odometry.forward_m_s, 0.0, 0.0])
             estimator.add(VelocityEvent(step * 100_000_000, V))
             errors.go_on(0.1)
-            seen = hall.scan(truth, points, errors.values, random)
-            ids = np.full(len(seen), UNKNOWN_ID)
-            estimator.add(ObservationEvent(step * 100_000_000, ids, seen))
-            if step > 50 and step % 10 == 0:
+            for event in self.seen(truth, errors.values, step * 100_000_000):
+                estimator.add(event)
+            if step > 50 and step % 10 == 0 and estimator.is_localised:
                 pose, P = estimator.uncertain_pose
                 error = error_of(hall.true_pose(estimator.stamp_ns * 1e-9), pose)
                 P = P[np.ix_([3, 4, 2], [3, 4, 2])]
-                nees.append(error @ np.linalg.solve(P, error) / 3.0)
+                off.append((*error, error @ np.linalg.solve(P, error) / 3.0))
+        return np.array(off)
+
+    def seen(self, truth, errors, stamp_ns):
+        """Yield what the sensor sees, which is mounted otherwise than stated."""
+        world, pose = self.world, truth @ self.mount
+        if world.scan:
+            points = world.scan(pose, world.landmarks, errors, self.random)
+            yield ObservationEvent(stamp_ns, np.full(len(points), UNKNOWN_ID), points)
+        elif seen := world.sightings(pose, world.landmarks, errors):
+            poses, ids = np.array(list(seen.values())), np.array(list(seen))
+            R = poses[:, :3, :3]
+            event = ObservationEvent(stamp_ns, ids, poses[:, :3, 3], orientations=R)
+            yield event.moved(hall.CAMERA)
+
+
+def test_among_reflectors_the_shipped_file_is_as_sure_as_it_may_be():
+    """Or its noise, or that of the hall, would be misstated."""
+    nees = []
+    for seed in range(2):
+        drive = Drive('reflectors', seed)
+        drive.estimator.load_map(robot.surveyed(drive.world, seed))
+        nees.append(drive.run(25)[:, 3])
     assert 0.4 < np.mean(nees) < 2.0
 
 
@@ -135,6 +165,19 @@ def test_distances_are_3_percent_long_and_one_in_five_is_through_a_wall():
     assert abs(np.median(off_m)) < 0.06
     assert 0.1 < np.mean(off_m > 4.0 * hall.RANGE_NOISE_M) < 0.2
     assert np.mean(off_m < -4.0 * hall.RANGE_NOISE_M) < 1e-3
+
+
+@pytest.mark.parametrize('file', ['apriltags', 'tags_on_tf', 'reflectors', 'wheeled_robot'])
+def test_a_mount_that_is_five_degrees_off_is_named_and_estimated(file):
+    mount = se3.from_rpy((0.0, 0.0, 0.0, 0.0, 0.0, np.radians(5.0)))
+    drive = Drive(file, mount=mount, localization_mode='uncertain')
+    drive.estimator.load_map(robot.surveyed(drive.world, 0))
+    off = drive.run(40)
+    (finding,) = of_mounting(drive.estimator.calibration)
+    assert 'further to the left than /tf says' in finding.what
+    (turn,) = (part for part in drive.estimator.calibration if part.name == 'sensor_rotation_z')
+    assert turn.value == pytest.approx(np.radians(5.0), abs=0.02)
+    assert np.sqrt(np.mean(np.sum(off[10:, :2] ** 2, axis=1))) < 0.15
 
 
 def test_wheels_drift_from_the_truth():
