@@ -286,6 +286,11 @@ class Hypotheses:
         """Landmarks that move with the robot, and are not used."""
         return self._standing.carried
 
+    @property
+    def slips(self) -> bool:
+        """Whether the wheels slip now."""
+        return self._standing.slip is not None
+
     def observe(self, event: ObservationEvent) -> Update:
         """Use an observation made at their instant; return what it did to the best one."""
         standing = self._standing

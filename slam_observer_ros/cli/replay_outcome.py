@@ -29,6 +29,7 @@ from slam_observer_ros.runs.accuracy import (
 from slam_observer_ros.runs.corrections import explained, SUSPICIOUS
 from slam_observer_ros.runs.error_health import of_errors
 from slam_observer_ros.runs.health import (
+    of_all_learnt,
     of_estimate,
     of_fit,
     of_left_out,
@@ -202,8 +203,10 @@ def judged(
         *of_timing(recording, selected),
         *(of_errors(outcome.whole_run) if outcome.whole_run is not None else ()),
     ]
-    if result.estimator.counts['slip'] or any(each.kind in SUSPICIOUS for each in findings):
-        findings = explained([*look_for_mistakes(), *findings])
+    reasons = [*findings, *of_all_learnt(result.estimator)]
+    if result.estimator.counts['slip'] or any(each.kind in SUSPICIOUS for each in reasons):
+        findings = [*look_for_mistakes(), *findings]
+    findings = explained(findings)
     findings.sort(key=lambda finding: -finding.level)
     for finding in findings:
         if finding.level >= Level.WARNING:

@@ -80,6 +80,11 @@ KINDS = {
         'let all publish one type, remap the others, or choose one by velocity_type or '
         'landmarks_type',
     ),
+    'several_publishers': Kind(
+        Level.WARNING,
+        "{count} publishers ({names}) publish on '{topic}'",
+        'remap all but one',
+    ),
     'empty_messages': Kind(
         Level.WARNING,
         'no landmark in {count} messages so far',
@@ -239,6 +244,12 @@ KINDS = {
         Level.WARNING,
         'no velocity in force: the pose is held',
         'see whether its driver has stopped, or velocity_timeout is too short for it',
+    ),
+    'rare_velocity': Kind(
+        Level.WARNING,
+        'a velocity comes only each {period_s:.1f} s, as commands by key press do: how the robot '
+        'moves meanwhile is not known, nor what delay and noise the velocities have',
+        "use the wheels' odometry, or let commands be repeated ten times a second",
     ),
     'late_odometry': Kind(
         Level.WARNING,

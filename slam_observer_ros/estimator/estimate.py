@@ -19,7 +19,7 @@ from slam_observer_ros.estimates import (
     Smoothed,
     Update,
 )
-from slam_observer_ros.estimator.event_warnings import EventWarnings
+from slam_observer_ros.estimator.event_warnings import EventWarnings, Undisturbed
 from slam_observer_ros.estimator.timeline import Timeline
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -45,7 +45,7 @@ class Estimate:
         self.last_update: Update | None = None  # None before the first observation
         self._hypotheses, self._localiser = hypotheses, localiser
         self._counts = Outcomes(is_kept=hypotheses.best.counts.is_kept)
-        self._warnings = EventWarnings()
+        self._warnings, self._undisturbed = EventWarnings(), Undisturbed()
         self._half_points = HalfPoints(self._counts)
 
     @property
@@ -290,6 +290,29 @@ class Estimate:
     def motion_factors(self) -> list[MotionFactor]:
         """Noise of turning and driving over what is stated; empty where it is not known."""
         return self._state.motion_noise.factors.estimates
+
+    @property
+    def undisturbed(self) -> tuple[list[CalibrationEstimate], list[MotionFactor]]:
+        """``calibration`` and ``motion_factors`` without what slips and the like pass for.
+
+        Without what was learnt before something was known that explains it: wheels that slip, a
+        robot or landmark that is carried, or what :meth:`.Estimator.distrust_odometry` was for.
+        """
+        clean = self._undisturbed
+        return (
+            [clean.of_calibration(part) for part in self.calibration],
+            [clean.of_noise(factor, self.settings) for factor in self.motion_factors],
+        )
+
+    @property
+    def has_rare_velocities(self) -> bool:
+        """Whether velocities come so seldom that each one that is missing leaves a gap."""
+        return 2.0 * self.velocity_period_s > self.settings.velocity_timeout
+
+    @property
+    def velocity_period_s(self) -> float:
+        """Median time between two velocities of late, seconds; 0 while that is not known."""
+        return self._timeline.velocities.median_period_s
 
     def knows_motion_since(self, stamp_ns: int) -> bool:
         """Return whether velocities are known from a stamp on, nanoseconds: of seconds at most."""

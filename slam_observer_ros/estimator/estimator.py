@@ -25,7 +25,7 @@ from slam_observer_ros.estimator.checks import (
 )
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.estimator.event_queue import EventQueue
-from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
+from slam_observer_ros.estimator.event_warnings import Undisturbed, UNEXPECTED_POSES
 from slam_observer_ros.estimator.placement import Placement
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
 from slam_observer_ros.events import (
@@ -98,6 +98,7 @@ class Estimator(Estimate):
         self._start_pose = None if pose is None else rigid(pose)
         self._placement.reset(self._start_pose)
         self._clear_time()
+        self._undisturbed = Undisturbed()
         self.last_update = None
 
     def handle_clock_jump(self, by_ns: int | None = None) -> None:
@@ -271,6 +272,12 @@ class Estimator(Estimate):
             self._process(ready)
         self._timeline.catch_up()
         self._report_stamp()
+        self._look(self.stamp_ns or 0)
+        self._undisturbed.end()
+
+    def distrust_odometry(self) -> None:
+        """Count what is learnt of it now to no delay or noise that :attr:`undisturbed` reports."""
+        self._undisturbed.is_disturbed = True
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""
@@ -394,8 +401,18 @@ class Estimator(Estimate):
             warnings.moved_landmarks(update.moved_ids, event.stamp_ns)
         if carried_ids := self._hypotheses.carried_ids:
             warnings.carried_landmarks(carried_ids)
-        warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
+        counts = self._hypotheses.some_counts((*UNEXPECTED_POSES, 'carried_landmark'))
+        warnings.unexpected_poses(counts[:-1])
+        signs = [*counts, self._localiser.counts['lost']]
+        if self._undisturbed.is_due(event.stamp_ns, signs):
+            self._look(event.stamp_ns)
         warnings.large_map(len(state.landmarks), limit, state.gains)
+
+    def _look(self, stamp_ns: int) -> None:
+        """Look at what was learnt of the odometry, now and then."""
+        if self._hypotheses.slips:
+            self.distrust_odometry()
+        self._undisturbed.look(stamp_ns, self.calibration, self.motion_factors)
 
     def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""

@@ -171,15 +171,44 @@ SYMPTOMS = frozenset(
 )
 """Findings that a mistake of the set-up may cause, and whose remedies would then be untrue."""
 
+OF_ODOMETRY = frozenset(
+    {
+        'late_odometry',
+        'implausible_calibration',
+        'noisy_odometry',
+        'axis_noise',
+        'motion_noise',
+        'small_noise',
+    }
+)
+"""Those of them that speak of the delay and the noise of the odometry."""
+
+_OF_POSE = frozenset({'unknown_pose', 'no_place', 'lost_pose', 'contradicted_pose', 'diverged'})
+
+EXPLAINED: Mapping[str, frozenset[str]] = {
+    **dict.fromkeys(MISTAKES, SYMPTOMS | {'rare_velocity'}),
+    # Where the robot is must be known, whatever the reason.
+    'several_publishers': (SYMPTOMS | MISTAKES | {'rare_velocity'}) - _OF_POSE,
+    'rare_velocity': OF_ODOMETRY,
+}
+"""By the kinds of causes: which findings they explain, whose remedies would be untrue."""
+
+ODOMETRY_CAUSES = frozenset(EXPLAINED) - MISTAKES
+"""Causes while which nothing can be learnt of the odometry."""
+
 SUSPICIOUS = SYMPTOMS - {'large_noise', 'error_growth', 'axis_noise', 'left_out_points'}
 """Those of them that are reason to look for one."""
 
 
 def explained(findings: Iterable[Finding]) -> list[Finding]:
-    """Return findings without those that a mistake of the set-up which is among them explains."""
+    """Return findings without those that another one of them explains."""
     findings = list(findings)
-    names_one = any(each.kind in MISTAKES for each in findings)
-    return [each for each in findings if not names_one or each.kind not in SYMPTOMS]
+    known = {each.kind for each in findings}
+    symptoms = {kind for cause in EXPLAINED.keys() & known for kind in EXPLAINED[cause]}
+    # A symptom explains nothing in its turn.
+    causes = known - symptoms
+    symptoms = {kind for cause in EXPLAINED.keys() & causes for kind in EXPLAINED[cause]}
+    return [each for each in findings if each.kind not in symptoms]
 
 
 DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi

@@ -126,6 +126,12 @@ class Diagnosed(Protocol):
     @property
     def open_sides(self) -> Sequence[int]: ...  # noqa: D102
     @property
+    def undisturbed(self) -> tuple[Sequence[CalibrationEstimate], Sequence[MotionFactor]]: ...  # noqa: D102
+    @property
+    def has_rare_velocities(self) -> bool: ...  # noqa: D102
+    @property
+    def velocity_period_s(self) -> float: ...  # noqa: D102
+    @property
     def lyapunov(self) -> float: ...  # noqa: D102
     @property
     def stamp_ns(self) -> int | None: ...  # noqa: D102
@@ -160,12 +166,19 @@ def of_velocity(estimator: Diagnosed) -> list[Finding]:
 
 def of_estimate(estimator: Diagnosed) -> list[Finding]:
     """Judge what is estimated of velocities and sensors, live and after a whole run alike."""
-    return [
-        *of_calibration(estimator.calibration),
-        *of_mounting(estimator.calibration),
-        *of_noise(estimator.motion_factors),
-        *of_half_points(estimator.anchor_biases, estimator.open_sides),
-    ]
+    calibration, factors = estimator.undisturbed
+    of_odometry = [*of_calibration(calibration), *of_noise(factors)]
+    if of_odometry and estimator.has_rare_velocities:
+        of_odometry.append(found('rare_velocity', period_s=estimator.velocity_period_s))
+    half_points = of_half_points(estimator.anchor_biases, estimator.open_sides)
+    return [*of_odometry, *of_mounting(calibration), *half_points]
+
+
+def of_all_learnt(estimator: Diagnosed) -> list[Finding]:
+    """Judge the same, be it explained by a slip or the like: a mistake may explain both."""
+    calibration = estimator.calibration
+    of_noise_learnt = of_noise(estimator.motion_factors)
+    return [*of_calibration(calibration), *of_mounting(calibration), *of_noise_learnt]
 
 
 def of_half_points(biases: Mapping[int, float], open_sides: Sequence[int]) -> list[Finding]:

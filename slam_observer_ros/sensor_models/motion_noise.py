@@ -74,6 +74,9 @@ KINDS = {'turning': 'angular', 'driving': 'linear'}
 
 _IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
 
+PRIOR_DEVIATION = 0.5
+"""Of the logarithm of a factor of the standard deviation at the start: half that of θ."""
+
 
 class MotionFigures(NamedTuple):
     """How far velocities may be off."""
@@ -245,12 +248,11 @@ class MotionFactors:
         if not self._found:
             return []
         deviations = 0.5 * np.sqrt(np.diagonal(np.linalg.inv(self._information + _PRIOR)))
-        each = zip(KINDS, self._logs, deviations, np.sqrt(self.applied), strict=True)
+        factors, applied = np.exp(0.5 * self._logs).tolist(), np.sqrt(self.applied).tolist()
+        each = zip(KINDS, factors, deviations.tolist(), applied, strict=True)
         return [
-            MotionFactor(
-                name, math.exp(0.5 * log), float(deviation), float(applied), self._proposed(name)
-            )
-            for name, log, deviation, applied in each
+            MotionFactor(name, factor, deviation, applied, proposed(name, factor, self._settings))
+            for name, factor, deviation, applied in each
         ]
 
     def move(self, shares: FloatArray | None) -> None:
@@ -320,17 +322,16 @@ class MotionFactors:
                 return self._score(r[passed], S[np.ix_(used, used)], C[used], N)
         return score(C.T.dot(S_inv_r)[:, 0], C.T.dot(S_inv_C), N, squared, r.size)
 
-    def _proposed(self, name: str) -> str:
-        """Return the settings that state what was found."""
-        position, kind = list(KINDS).index(name), KINDS[name]
-        factor = math.exp(0.5 * self._logs[position])
-        names = [f'{kind}_velocity_noise', f'{kind}_scale_noise']
-        stated = {each: getattr(self._settings, each) for each in names}
-        return ', '.join(
-            f'{each}: [{", ".join(significant(factor * value, 2) for value in values)}]'
-            for each, values in stated.items()
-            if any(values)
-        )
+
+def proposed(name: str, factor: float, settings: Settings) -> str:
+    """Return the settings that state a factor of the noise of ``'turning'`` or ``'driving'``."""
+    names = [f'{KINDS[name]}_velocity_noise', f'{KINDS[name]}_scale_noise']
+    stated = {each: getattr(settings, each) for each in names}
+    return ', '.join(
+        f'{each}: [{", ".join(significant(factor * value, 2) for value in values)}]'
+        for each, values in stated.items()
+        if any(values)
+    )
 
 
 def score(

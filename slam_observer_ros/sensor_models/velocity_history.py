@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, fields
 import math
+from statistics import median_low
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -28,6 +29,9 @@ BLOCK, BLOCKS = 64, 16
 
 So many that they have pauses in them where these are usual, as of commands.
 """
+
+FEWEST_PERIODS = 5
+"""Periods that show how often messages come: a pause or two among them change nothing."""
 
 STANDS_NS = NANOSECONDS_PER_SECOND
 """How long a velocity must have been exactly zero before the robot stands, nanoseconds.
@@ -129,6 +133,14 @@ class VelocityHistory:
         if stand:
             self._let_stand(np.array(stand))
         return True
+
+    @property
+    def median_period_s(self) -> float:
+        """Median time between two velocities of late, seconds; 0 while that is not known.
+
+        Means over the time since the last one count as any number of them.
+        """
+        return self._periods.median_s
 
     def _note_zero(self, stamp_ns: int) -> bool:
         """Note a velocity that is exactly zero; return whether the robot stands by then."""
@@ -370,6 +382,7 @@ class _Periods:
         self._last_ns: int | None = None
         self._usual_ns = -1  # what a period must be longer than to change it
         self.usual_s = math.inf
+        self._recent_ns: deque[int] = deque(maxlen=BLOCK)
 
     def add(self, stamp_ns: int) -> float:
         """Take the stamp of the next message; return ``usual_s``."""
@@ -378,6 +391,7 @@ class _Periods:
             return self.usual_s
         period_ns = stamp_ns - last_ns
         self._block_ns.append(period_ns)
+        self._recent_ns.append(period_ns)
         is_full = len(self._block_ns) == BLOCK
         if is_full:
             self._longest_ns.extend(sorted(self._block_ns)[-2:])
@@ -385,6 +399,12 @@ class _Periods:
         if is_full or period_ns > self._usual_ns:
             self._judge()
         return self.usual_s
+
+    @property
+    def median_s(self) -> float:
+        """Half of the periods of late are longer, seconds; 0 while there are few."""
+        few = len(self._recent_ns) < FEWEST_PERIODS
+        return 0.0 if few else to_s(int(median_low(self._recent_ns)))
 
     def _judge(self) -> None:
         longest_ns = sorted([*self._longest_ns, *self._block_ns])[-2:]

@@ -291,7 +291,9 @@ class Publishing:
         self.dropped = Counter()
         self.estimator = SimpleNamespace(
             counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
-            calibration=[], motion_factors=[], lyapunov=0.0, stamp_ns=None,
+            calibration=[], motion_factors=[], undisturbed=([], []), lyapunov=0.0, stamp_ns=None,
+            has_rare_velocities=False, velocity_period_s=0.05, distrust_odometry=Mock(),
+            anchor_biases={}, open_sides=[],
             velocity_is_stale=False, is_localised=True, ambiguity=None, waiting_landmarks=0,
             settings=Settings(),
             localisation_problem=NO_PLACE, possible_poses=np.empty((0, 4, 4)),
@@ -305,9 +307,12 @@ class Publishing:
         self.estimate_publisher = SimpleNamespace(
             problem='', rivals=str, early_odometry=str, odometry_age_s=None
         )
-        localisation = SimpleNamespace(status=lambda _hardware_id: DiagnosticStatus(), findings=[])
-        watch = Mock(findings=[])
-        parts = self.estimator, self.feed, inputs, self.estimate_publisher, localisation, watch
+        self.localisation = SimpleNamespace(status=lambda *_: DiagnosticStatus(), findings=[])
+        self.watch = Mock(findings=[])
+        parts = (
+            self.estimator, self.feed, inputs, self.estimate_publisher, self.localisation,
+            self.watch,
+        )  # fmt: skip
         self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')
 
     def publish(self, **new):
@@ -324,6 +329,29 @@ def test_an_id_that_is_there_twice_is_reported_with_what_to_do():
     assert status.level == DiagnosticStatus.WARN
     assert status.message.startswith('landmark 7 is seen now at')
     assert finding.remedy in values_of(status).values()
+
+
+def test_two_publishers_are_named_and_nothing_that_they_cause():
+    rivals = found('several_publishers', count=2, names='/wheels, /truth', topic='/odom')
+    odom = SimpleNamespace(
+        topic='/odom', name='twist', received=30, malformed=0, problem='', doubt=rivals, age_s=0.1,
+        silent_s=0.0, last_malformed=None, backlog=SimpleNamespace(wait_s=0.0),
+        shedding=SimpleNamespace(shed=0),
+    )  # fmt: skip
+    late = CalibrationEstimate('velocity_delay', 0.5, 0.01, 's', stated=0.2)
+    publishing = Publishing(odom, undisturbed=([late], []))
+    publishing.localisation.findings = [found('small_noise', factor=3.0)]
+    status = publishing.publish(velocity=10, slip=1)
+    assert status.message == "2 publishers (/wheels, /truth) publish on '/odom'"
+    to_do = [each.value for each in status.values if each.key.startswith('to do')]
+    assert to_do == ['remap all but one']
+    publishing.estimator.distrust_odometry.assert_called_with()
+    # No mistake of the set-up is searched for, and the noise is said to fit neither.
+    assert publishing.watch.look.call_args.kwargs == {'has_slipped': False}
+    assert publishing.watch.look.call_args.args == ([],)
+    odom.doubt = None
+    assert 'takes effect 0.50 s late' in publishing.publish(velocity=10, slip=1).message
+    assert publishing.watch.look.call_args.kwargs == {'has_slipped': True}
 
 
 @pytest.mark.parametrize(
@@ -368,7 +396,7 @@ def test_a_detector_that_finds_nothing_is_reported_and_logged_once():
 
 def test_a_calibration_that_nobody_can_mean_is_reported():
     wrong = CalibrationEstimate('angular_scale_z', -0.5, 0.01, '', nominal=1.0, stated=0.03)
-    status = Publishing(calibration=[wrong]).publish(observation=1)
+    status = Publishing(undisturbed=([wrong], [])).publish(observation=1)
     assert status.level == DiagnosticStatus.WARN
     (finding,) = of_calibration([wrong])
     assert (status.message, values_of(status)[f'to do: {finding.what}']) == (

@@ -106,3 +106,15 @@ def test_what_a_mistake_explains_is_left_out():
         found('turning_negated'),
         *others,
     ]
+
+
+def test_two_publishers_explain_what_a_mistake_would_and_each_is_said_once():
+    rivals = found('several_publishers', count=2, names='/a, /b', topic='/odom')
+    rare = found('rare_velocity', period_s=1.5)
+    late = found('late_odometry', delay_s=0.5, when='late', set_to=0.5)
+    lost, negated = found('unknown_pose'), found('turning_negated')
+    assert explained([late, rivals]) == [rivals]
+    assert explained([late, rare]) == [rare]
+    assert explained([late, rare, negated]) == [negated]
+    # What they explain explains nothing, but where the robot is must be known.
+    assert explained([lost, negated, late, rare, rivals]) == [lost, rivals]

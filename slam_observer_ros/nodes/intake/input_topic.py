@@ -40,12 +40,12 @@ MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
 
 
-def rivals(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
-    """Report who publishes on a topic, if more than one does; else ''."""
+def rivals(topic: str, publishers: Sequence[TopicEndpointInfo]) -> Finding | None:
+    """Report who publishes on a topic, if more than one does; else None."""
     if len(publishers) < 2:
-        return ''
+        return None
     names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
-    return f"{len(names)} publishers ({', '.join(names)}) publish on '{topic}': remap all but one"
+    return found('several_publishers', count=len(names), names=', '.join(names), topic=topic)
 
 
 def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
@@ -182,6 +182,7 @@ class InputTopic(Generic[MessageT]):
         self._subscription: Subscription | None = None
         self._types = TypeChoice()
         self._several_types: Finding | None = None
+        self._rivals: Finding | None = None
         self.name = name
         self.topic = node.resolve_topic_name(name)
         self.received = 0
@@ -240,9 +241,9 @@ class InputTopic(Generic[MessageT]):
 
     @property
     def doubt(self) -> Finding | None:
-        """What is wrong with the types or the content of messages; None if nothing."""
+        """What is wrong with publishers, types or content of messages; None if nothing."""
         of_content: Finding | None = getattr(self._decoders.get(self._types.chosen), 'doubt', None)
-        return self._several_types or of_content
+        return self._several_types or self._rivals or of_content
 
     def check_publishers(self) -> None:
         """See what the topic carries; subscribe to it, or report why nothing comes.
@@ -261,12 +262,16 @@ class InputTopic(Generic[MessageT]):
         usable = [name for name in self._decoders if name in types]
         missing = self._listen_for_one_of(usable, now_s)
         self._fault = missing or self._find_fault(publishers, usable)
+        # Where they publish several types, the finding of that names the cause.
+        is_shared = self.is_shared or self._several_types is not None
+        self._rivals = None if is_shared else rivals(self.topic, publishers)
         # A robot that is parked may be silent for days.
         is_silent = bool(self.received and not self._fault and self.silent_s > DISCOVERY_S)
         silence = self.received, self._clock_stands
         if is_silent and silence == self._said_silent:
             return
-        problem = self.problem or (self.doubt and self.doubt.text())
+        rivals_first = self._rivals and self._rivals.text()
+        problem = rivals_first or self.problem or (self.doubt and self.doubt.text())
         if problem and self._log.warning(self.topic, problem) and is_silent:
             self._said_silent = silence
 
@@ -422,11 +427,6 @@ class InputTopic(Generic[MessageT]):
             types = sorted({publisher.topic_type for publisher in publishers})
             hint = ''.join(f'; set {self.advice[t]}' for t in types if t in self.advice)
             return f"'{self.topic}' carries {', '.join(types)}; {wanted} is needed{hint}"
-        # Where they publish several types, the finding of that names the cause.
-        if not (self.is_shared or self._several_types) and (
-            text := rivals(self.topic, publishers)
-        ):
-            return text
         for publisher in publishers:
             compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
             if compatibility == QoSCompatibility.ERROR:

@@ -11,16 +11,17 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
 from slam_observer_ros.common.types import is_automatic
-from slam_observer_ros.estimator.estimate import Estimate
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus
 from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
-from slam_observer_ros.runs.corrections import explained
+from slam_observer_ros.runs.corrections import explained, ODOMETRY_CAUSES
 from slam_observer_ros.runs.health import (
     estimator_values,
+    of_all_learnt,
     of_estimate,
     of_left_out,
     of_map_without_ids,
@@ -45,7 +46,7 @@ class DiagnosticsPublisher:
     def __init__(
         self,
         node: GuardedNode,
-        estimator: Estimate,
+        estimator: Estimator,
         feed: EstimatorFeed,
         inputs: Sequence[InputTopic[Any]],
         estimate_publisher: EstimatePublisher,
@@ -77,7 +78,14 @@ class DiagnosticsPublisher:
         """Publish the status of the estimate and of the localisation, about once a second."""
         dropped, new = self._progress()
         symptoms = self._findings(dropped, new)
-        self._watch.look([*symptoms, *self._localisation.findings], has_slipped=new['slip'] > 0)
+        of_both = explained([*symptoms, *self._localisation.findings])
+        disturbs = any(each.kind in ODOMETRY_CAUSES for each in symptoms)
+        if disturbs:
+            self._estimator.distrust_odometry()
+            self._watch.look([], has_slipped=False)
+        else:
+            reasons = [*of_both, *of_all_learnt(self._estimator)]
+            self._watch.look(reasons, has_slipped=new['slip'] > 0)
         findings = explained([*self._watch.findings, *symptoms])
         level = max((finding.level for finding in findings), default=Level.NOTE)
         used = new['velocity'] + new['observation']
@@ -98,7 +106,9 @@ class DiagnosticsPublisher:
             message=in_brief(problems) or 'running',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
-        message = DiagnosticArray(status=[status, self._localisation.status(self._hardware_id)])
+        of_fit = [each for each in self._localisation.findings if each in of_both]
+        localisation = self._localisation.status(self._hardware_id, of_fit)
+        message = DiagnosticArray(status=[status, localisation])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 

@@ -154,10 +154,11 @@ class EstimatePublisher:
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""
         topic = self._node.resolve_topic_name('~/odometry')
-        text = rivals(topic, self._node.get_publishers_info_by_topic(topic))
-        if text:
-            self._log.warning(topic, text)
-        return text
+        finding = rivals(topic, self._node.get_publishers_info_by_topic(topic))
+        if finding is None:
+            return ''
+        self._log.warning(topic, finding.text())
+        return finding.text()
 
     def is_due(self, source: str) -> bool:
         """Whether ``publish_rate`` allows to publish now what an input has given; '' for none."""

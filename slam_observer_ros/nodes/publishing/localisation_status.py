@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 import numpy as np
@@ -90,11 +91,11 @@ class LocalisationStatus:
         """What is wrong with the noise that is stated."""
         return self._noise.findings
 
-    def status(self, hardware_id: str) -> DiagnosticStatus:
-        """Return the status for /diagnostics."""
+    def status(self, hardware_id: str, findings: Iterable[Finding]) -> DiagnosticStatus:
+        """Return the status for /diagnostics, with those findings that nothing else explains."""
         deviations = self._deviations()
         level, message = self._judge(deviations)
-        for finding in self.findings:
+        for finding in findings:
             if finding.level >= Level.WARNING:
                 level = max(level, DiagnosticStatus.WARN)
                 message = f'{message}; {finding.what}'
