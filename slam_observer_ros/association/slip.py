@@ -20,7 +20,6 @@ from slam_observer_ros.geometry.matrices import (
 )
 from slam_observer_ros.geometry.se3 import rigid_alignment
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.state.matching import MatchedObservation
 from slam_observer_ros.state.state import State
 
@@ -52,7 +51,7 @@ def slip(state: State, matched: MatchedObservation) -> float:
     observer, start = state.observer, state.observer.A.copy()
     needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
     variances = _variances(state, needed_s)
-    _stray(state, needed_s, _pose_after(state, matched, variances))
+    state.slip(_pose_after(state, matched, variances), _noise(state, needed_s))
     state.counts['slip'] += 1
     strayed = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
     return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
@@ -62,30 +61,20 @@ def astray(state: State) -> Iterator[State]:
     """Yield copies of a state from which points without ids show where a slip may have led it."""
     for turn_rad in (0.0, TURN_RAD, -TURN_RAD):
         other = state.copy()
-        _stray(other, SHORT_S, other.observer.A @ se3.exp(np.array([0, 0, turn_rad, 0, 0, 0])))
+        turn = se3.exp(np.array([0, 0, turn_rad, 0, 0, 0]))
+        other.slip(other.observer.A @ turn, _noise(other, SHORT_S))
         yield other
 
 
-def _stray(state: State, duration_s: float, after: FloatArray) -> None:
-    """Move a state to Â = ``after`` (4, 4), without odometry for so long."""
-    stray = HeldVelocities.unknown(np.array([0.0, duration_s]))
-    motion = Motion(
-        path=np.array([state.observer.A.copy(), after, after]),
-        measured_velocities=stray.body_velocities,
-        dt_s=stray.dt_s,
-        covariances=state.motion_noise.covariances(stray),
-        duration_s=0.0,
-        at_ends=None,
-        calibration=state.calibration,
-        is_slip=True,
-    )
-    state.propagate(motion)
+def _noise(state: State, duration_s: float) -> FloatArray:
+    """Return the covariance (6, 6) of a motion without odometry for so long."""
+    stray = HeldVelocities.unknown(np.array([duration_s]))
+    return np.asarray(state.motion_noise.covariances(stray)[0])
 
 
 def _variances(state: State, duration_s: float) -> FloatArray:
     """Return the variances (p,) of a motion without odometry for so long."""
-    noise = state.motion_noise.covariances(HeldVelocities.unknown(np.array([0.0, duration_s])))
-    variances: FloatArray = np.diagonal(noise[1])[state.axes.pose]
+    variances: FloatArray = np.diagonal(_noise(state, duration_s))[state.axes.pose]
     return np.maximum(variances, MIN_VARIANCE)
 
 

@@ -157,6 +157,23 @@ class State:
         if motion.at_ends is not None:
             self.end_velocity = motion.at_ends[1]
 
+    def slip(self, after: FloatArray, covariance: FloatArray) -> None:
+        """Let the robot be at Â = ``after`` (4, 4), by a motion that odometry has not seen.
+
+        Its ``covariance`` (6, 6) is in the body frame there, rad² and m².
+        """
+        motion = Motion(
+            path=np.array([self.observer.A, after, after]),
+            measured_velocities=np.zeros((2, 6)),
+            dt_s=np.zeros(2),
+            covariances=np.array([np.zeros((6, 6)), covariance]),
+            duration_s=0.0,
+            at_ends=None,
+            calibration=self.calibration,
+            is_slip=True,
+        )
+        self.propagate(motion)
+
     def update(
         self,
         stamp_ns: int,
