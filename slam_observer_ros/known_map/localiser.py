@@ -276,9 +276,9 @@ class Localiser:
             )
         elif not self._said_problem and len([p for p in self.places if p.share > LEAST_SHARE]) > 1:
             self._said_problem = True
-            problem = self.problem(state.observer.A)
-            if problem is not None and problem.kind == 'ambiguous_place':  # others are known
-                logger.warning('%s', problem)
+            finding = self.problem(state.observer.A)
+            if finding is not None and finding.kind == 'ambiguous_place':  # others are known
+                logger.warning('%s', finding)
 
     def enter(self, state: State) -> bool:
         """Move an estimate into the frame of a loaded map, if landmarks with ids suffice."""

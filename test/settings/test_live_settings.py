@@ -183,14 +183,14 @@ def test_what_an_estimator_was_made_with_does_not_matter_after_a_change(row, gai
 def test_all_hypotheses_follow_a_change():
     settings = Settings(two_d_mode=True, unknown_linear_motion=1.0, reorder_window=0.0)
     estimator = Estimator(settings)
-    posts = np.array([[2.0, 1.0, 0.0], [2.0, -1.0, 0.0], [6.0, 3.0, 0.0]])
+    posts = np.array([[2.0, 1.0, 0.0], [2.0, -1.0, 0.0]])
     for step in range(10):
         estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
-        estimator.add(ObservationEvent(step * 10**8, np.arange(2), posts[:2]))
+        estimator.add(ObservationEvent(step * 10**8, np.full(2, UNKNOWN_ID), posts))
     after_blind_stretch_ns = 9 * 10**9
     estimator.add(VelocityEvent(after_blind_stretch_ns, np.zeros(6)))
-    wrong = np.array([0]), posts[2:] - [4.0, 0.0, 0.0]
-    estimator.add(ObservationEvent(after_blind_stretch_ns, *wrong))
+    either = np.array([UNKNOWN_ID]), np.array([[2.0, 0.0, 0.0]])
+    estimator.add(ObservationEvent(after_blind_stretch_ns, *either))
     estimator.flush()
     assert len(estimator._hypotheses) == 2
     estimator.change_settings(replace(settings, huber_threshold=0.5, rejection_threshold=3.0))
