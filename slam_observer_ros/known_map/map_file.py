@@ -185,9 +185,9 @@ def read_maps(path: Path) -> list[LandmarkMap]:
 
     Raise :exc:`MapError` as :func:`read_map` does, or if there is none in the folder.
     """
-    if not path.is_dir():
-        return [read_map(path)]
     files, maps = map_files(path), list[LandmarkMap]()
+    if files == [path]:
+        return [read_map(path)]
     stems = Counter(file.stem for file in files)
     for file in files:
         try:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
 from slam_observer_ros.common.stamps import to_s
@@ -100,6 +100,10 @@ MOUNTED = {
 """In words, by axis, how a sensor is mounted whose turn or shift is positive/negative."""
 
 
+Learnt: TypeAlias = tuple[Sequence[CalibrationEstimate], Sequence[MotionFactor]]
+"""Calibration and noise of the odometry."""
+
+
 class Diagnosed(Protocol):
     """What is looked at of an :class:`.Estimator`."""
 
@@ -126,7 +130,7 @@ class Diagnosed(Protocol):
     @property
     def open_sides(self) -> Sequence[int]: ...  # noqa: D102
     @property
-    def undisturbed(self) -> tuple[Sequence[CalibrationEstimate], Sequence[MotionFactor]]: ...  # noqa: D102
+    def undisturbed(self) -> Learnt: ...  # noqa: D102
     @property
     def has_rare_velocities(self) -> bool: ...  # noqa: D102
     @property

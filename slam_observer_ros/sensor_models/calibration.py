@@ -305,7 +305,7 @@ class Calibration:
         return rates
 
     def initial_covariance(self) -> FloatArray:
-        """Return the covariance (p + c, p + c) of (ε, c̃) at the start, of no error of the pose."""
+        """Return the covariance (p + c, p + c) of (ε, c̃) at the start, without error of Â."""
         return np.diag(np.append(np.zeros(self.axes.p), self.initial_variances))
 
     def shift(self, change: FloatArray) -> None:

@@ -60,7 +60,7 @@ def test_help_names_what_a_robot_needs_first_before_the_advanced_parameters(
         ('replay nothing.mcap --gains best', "--gains: invalid choice: 'best'"),
         (
             'replay nothing.mcap --config nowhere',
-            'with the package come: apriltags, floor_codes, localization',
+            'with the package come: apriltags, bearings, floor_codes, localization',
         ),
         (
             'replay nothing.mcap --config nowhere/a.yaml',

@@ -51,7 +51,7 @@ class Watched:
 
     @property
     def status(self):
-        return self.part.status('robot1')
+        return self.part.status('robot1', self.part.findings)
 
     @property
     def published(self):
