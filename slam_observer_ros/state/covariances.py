@@ -113,7 +113,8 @@ def turned_moment(
     root = axes * np.sqrt(np.maximum(scales, 0.0))
     # d_i = G z + a part that is independent of z, w = root z, z of unit variance.
     G = with_turns @ np.linalg.pinv(root).T
-    others = (covariance - G @ G.T).reshape(-1, k, len(covariance))
+    n = len(covariance)
+    others = (covariance - G @ G.T).reshape(n // k, k, n)  # n may be 0
     moment = np.zeros_like(covariance)
     for z, weight in zip(product(_NODES, repeat=q), product(_WEIGHTS, repeat=q), strict=True):
         w = np.zeros(3)

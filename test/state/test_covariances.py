@@ -6,7 +6,10 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.covariances import SMALL_RAD, turned_moment
 
 
@@ -30,3 +33,12 @@ def test_errors_are_as_large_as_those_that_are_drawn(q, k):
 def test_where_the_attitude_is_known_nothing_changes():
     P = np.diag([0.9 * SMALL_RAD**2, 1.0, 4.0])
     assert_array_equal(turned_moment(P[1:, 1:], P[1:, :1], P[:1, :1]), P[1:, 1:])
+
+
+@pytest.mark.parametrize('two_d_mode', [True, False])
+def test_of_no_landmarks_there_is_an_empty_covariance_however_unknown_the_heading(two_d_mode):
+    settings = Settings(reorder_window=0.0, two_d_mode=two_d_mode)
+    estimator = Estimator(settings)
+    estimator.add(ObservationEvent(0, np.arange(3), np.diag([3.0, 2.0, 0.0])))
+    estimator.set_pose(np.eye(4), np.eye(6))
+    assert estimator.configuration_covariance(np.empty(0, dtype=np.int64)).shape == (0, 0)
