@@ -211,12 +211,6 @@ class ObservationEvent:
         sensed = None if self.sensed is None else self.sensed.select(mask)
         return replace(self, sensed=sensed, **picked)
 
-    def without(self, ids: set[int]) -> ObservationEvent:
-        """Return the points that are of none of some landmarks."""
-        if ids.isdisjoint(self.ids.tolist()):
-            return self
-        return self.select(~np.isin(self.ids, list(ids)))
-
 
 Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
 """Anything that :meth:`slam_observer_ros.estimator.estimator.Estimator.add` takes."""

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.association.joint_compatibility import huber_loss, joint_cost, unpaired_cost
+from slam_observer_ros.association.joint_compatibility import joint_cost, unpaired_cost
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.events import ObservationEvent
@@ -19,7 +19,7 @@ from slam_observer_ros.geometry.matrices import (
     with_blocks,
 )
 from slam_observer_ros.observer.observer import Residuals
-from slam_observer_ros.observer.robust import gated
+from slam_observer_ros.observer.robust import gated, huber_loss
 from slam_observer_ros.state.matching import (
     MatchedObservation,
     rejected_before,

@@ -297,10 +297,11 @@ class Hypotheses:
         if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
             self._judge(event)
         if standing.excluded:
-            whole, event = event, event.without(standing.excluded)
-            carried = whole.ids[~np.isin(whole.ids, event.ids)]
+            is_carried = np.isin(event.ids, list(standing.excluded))
             for hypothesis in self._all:
-                hypothesis.state.counts.note(Reason.CARRIED, carried, event.stamp_ns)
+                counts = hypothesis.state.counts
+                counts.note(Reason.CARRIED, event.ids[is_carried], event.stamp_ns)
+            event = event.select(~is_carried)
         update = self._observe(event)
         self._note_ambiguity(event)
         return update

@@ -27,6 +27,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis, transpose
+from slam_observer_ros.observer.robust import huber_loss
 
 MAX_PARTIAL = 16
 """Pairings of the points so far, the cheapest, that are extended by the next point.
@@ -41,9 +42,6 @@ have ids, at odds of e^17.5: a slip costs what it is set to cost, and few points
 
 RESOLUTION = 2.0
 """Standard deviations of the sensor within which two poses can't be distinguished."""
-
-HEAVY_TAIL = 2.0
-"""Standard deviations from which on the cost of a pair grows in proportion to its distance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,13 +217,6 @@ def pruning_cost(ids: IntArray) -> float:
 def unpaired_cost(gate: float) -> float:
     """Return the cost of a point of no known landmark: as likely as a pair at ``gate`` σ."""
     return float(huber_loss(gate))
-
-
-def huber_loss(distances: FloatArray | float) -> FloatArray:
-    """Return h(d): d² near zero, and from ``HEAVY_TAIL`` on a line."""
-    near = np.minimum(distances, HEAVY_TAIL)
-    loss: FloatArray = near * (2.0 * distances - near)
-    return loss
 
 
 def columns_of(pairs: list[int], k: int) -> IntArray:

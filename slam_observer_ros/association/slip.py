@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.association.joint_compatibility import huber_loss
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import (
@@ -19,6 +18,7 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
 )
 from slam_observer_ros.geometry.se3 import rigid_alignment
+from slam_observer_ros.observer.robust import huber_loss
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.state.matching import MatchedObservation
 from slam_observer_ros.state.state import State
@@ -50,8 +50,9 @@ def slip(state: State, matched: MatchedObservation) -> float:
     # The noise of a motion without odometry, for as long as it takes, to where landmarks put it.
     observer, start = state.observer, state.observer.A.copy()
     needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
-    variances = _variances(state, needed_s)
-    state.slip(_pose_after(state, matched, variances), _noise(state, needed_s))
+    noise = _noise(state, needed_s)
+    variances = np.maximum(np.diagonal(noise)[state.axes.pose], MIN_VARIANCE)
+    state.slip(_pose_after(state, matched, variances), noise)
     state.counts['slip'] += 1
     strayed = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
     return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
@@ -70,12 +71,6 @@ def _noise(state: State, duration_s: float) -> FloatArray:
     """Return the covariance (6, 6) of a motion without odometry for so long."""
     stray = HeldVelocities.unknown(np.array([duration_s]))
     return np.asarray(state.motion_noise.covariances(stray)[0])
-
-
-def _variances(state: State, duration_s: float) -> FloatArray:
-    """Return the variances (p,) of a motion without odometry for so long."""
-    variances: FloatArray = np.diagonal(_noise(state, duration_s))[state.axes.pose]
-    return np.maximum(variances, MIN_VARIANCE)
 
 
 def _duration_s(state: State, matched: MatchedObservation) -> float:

@@ -20,7 +20,12 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, PLANAR
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.robust import straight_odds, straight_share
+from slam_observer_ros.observer.robust import (
+    HEAVY_TAIL,
+    huber_loss,
+    straight_odds,
+    straight_share,
+)
 from slam_observer_ros.state.half_points import MEASURED, of_axes
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.waiting_room import FEWEST_VIEWS, Window
@@ -35,9 +40,6 @@ FIRST_STEPS, STEPS, FITTING_STEPS = 5, 20, 10
 
 ONE = 0.03
 """Rad, and share of the map, within which two descents have ended at one minimum."""
-
-HUBER = 2.0
-"""Standard deviations from which on a view counts less."""
 
 TRY_AGAIN, MOST_BETWEEN = 1.2, 10
 """By how many times the views have grown when it is searched again, and after how many at most."""
@@ -69,9 +71,7 @@ class Views:
     directions: FloatArray  # (n, 3) unit vectors along the body's axes then
     is_direction: BoolArray  # (n, 3) what of them was measured: along x, y, z
     variances: FloatArray  # (n, 2) of ranges, m², and of directions, rad²
-    walks: (
-        FloatArray  # (n, 6, 6) covariance of the way from then until now, in the body's axes now
-    )
+    walks: FloatArray  # (n, 6, 6) covariance of the way until now, in the body's axes now
     sensors: IntArray  # (n,) which sensor each is of: each has a scale of its own
 
     def mirrored(self) -> Views:
@@ -221,7 +221,7 @@ def _views(window: Window, state: State, known: LandmarkMap) -> Views | None:
         ranges=np.where(measured[:, 0], range_m, np.nan),
         directions=partial / np.maximum(level, 1e-9),
         is_direction=is_direction,
-        variances=np.column_stack([variances[:, 0], variances[:, 1]]),
+        variances=variances[:, :2],
         walks=Ad @ walks @ Ad.T,
         sensors=np.array([sensors.index(view.sensor_frame) for view in views]),
     )
@@ -330,11 +330,14 @@ class _Problem:
     def _columns(self, n_s: int) -> IntArray:
         return np.append(np.arange(6)[self._axes.pose], 6 + np.arange(n_s))
 
-    def _robust(self, e: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return costs (b,) by Huber, and weights (b, n, 4)."""
+    def _robust(
+        self, e: FloatArray, s: FloatArray, variances: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return costs (b,) by Huber and of the scales, and weights (b, n, 4)."""
         off = np.abs(e) / np.sqrt(variances)
-        costs = np.where(off <= HUBER, off**2, 2.0 * HUBER * off - HUBER**2)
-        return costs.sum(axis=(1, 2)), HUBER / np.maximum(off, HUBER)
+        of_scales = ((s / self._scale_sigma) ** 2).sum(axis=1)
+        costs: FloatArray = huber_loss(off).sum(axis=(1, 2)) + of_scales
+        return costs, HEAVY_TAIL / np.maximum(off, HEAVY_TAIL)
 
     def descend(
         self, T: FloatArray, s: FloatArray, steps: int
@@ -345,8 +348,7 @@ class _Problem:
         e, lines, lengths = self.parts(T, s)
         for _ in range(steps):
             variances = self.variances(lengths)
-            costs, weights = self._robust(e, variances)
-            costs = costs + ((s / self._scale_sigma) ** 2).sum(axis=1)
+            costs, weights = self._robust(e, s, variances)
             J, _ = self.jacobian(T, s, lines, lengths)
             J = J[..., columns].reshape(len(T), -1, len(columns))
             W = (weights / variances).reshape(len(T), -1)
@@ -363,8 +365,7 @@ class _Problem:
             )[..., 0]
             T_new, s_new = self._moved(T, s, step)
             e_new, lines_new, lengths_new = self.parts(T_new, s_new)
-            costs_new, _ = self._robust(e_new, variances)
-            costs_new = costs_new + ((s_new / self._scale_sigma) ** 2).sum(axis=1)
+            costs_new, _ = self._robust(e_new, s_new, variances)
             better = costs_new < costs
             damping = np.clip(np.where(better, 0.2 * damping, 8.0 * damping), 1e-6, 1e6)
             T = np.where(better[:, None, None], T_new, T)
@@ -377,8 +378,7 @@ class _Problem:
     def costs(self, T: FloatArray, s: FloatArray) -> FloatArray:
         """Return χ² (b,) of poses, each view by itself."""
         e, _, lengths = self.parts(T, s)
-        costs, _ = self._robust(e, self.variances(lengths))
-        return np.asarray(costs + ((s / self._scale_sigma) ** 2).sum(axis=1))
+        return self._robust(e, s, self.variances(lengths))[0]
 
     def _moved(
         self, T: FloatArray, s: FloatArray, step: FloatArray
@@ -451,8 +451,7 @@ class _Problem:
     ) -> tuple[FloatArray, FloatArray]:
         """Return costs and weights (q,) of residuals: Huber's, and by odds of ranges too long."""
         off = np.abs(r) / sigmas
-        costs = np.where(off <= HUBER, off**2, 2.0 * HUBER * off - HUBER**2)
-        weights = HUBER / np.maximum(off, HUBER)
+        costs, weights = huber_loss(off), HEAVY_TAIL / np.maximum(off, HEAVY_TAIL)
         is_range = rows % 4 == 0
         odds = straight_odds(sigmas, self._ranges[rows // 4])
         share = straight_share(np.where(is_range, np.sqrt(costs) * np.sign(r), 0.0), odds)

@@ -29,6 +29,9 @@ AT_ONCE = 32
 REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
 
+HEAVY_TAIL = 2.0
+"""Standard deviations from which on the cost of a residual grows in proportion to its distance."""
+
 DETOURS = 0.2
 """Share of the ranges that came through a wall or by a reflection, where nothing is known of it:
 one in five, as of points without ids that are of no landmark (known_map/places.py)."""
@@ -102,6 +105,13 @@ def straight_share(off: FloatArray, odds: FloatArray) -> FloatArray:
     is_long = off > 0.0
     straight = odds * np.exp(-0.5 * np.square(np.where(is_long, off, 0.0)))
     return np.where(is_long, straight / (1.0 + straight), 1.0)
+
+
+def huber_loss(distances: FloatArray | float) -> FloatArray:
+    """Return h(d): d² near zero, and from ``HEAVY_TAIL`` on a line."""
+    near = np.minimum(distances, HEAVY_TAIL)
+    loss: FloatArray = near * (2.0 * distances - near)
+    return loss
 
 
 def huber_weights(

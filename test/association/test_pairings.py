@@ -17,7 +17,6 @@ from slam_observer_ros.association.hypothesis import LandmarkIndex
 from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
-    huber_loss,
     joint_cost,
     JointSearch,
     MAX_PARTIAL,
@@ -25,6 +24,7 @@ from slam_observer_ros.association.joint_compatibility import (
 )
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.observer.robust import huber_loss
 from slam_observer_ros.state.matching import match
 
 
