@@ -7,22 +7,34 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 import math
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
-class Reason(Enum):
-    """Why a point that was observed is not used: each such point has exactly one reason.
 
-    The value is the name under which the points are counted in :attr:`.Estimator.counts`.
-    ``words`` follow a number of points, and ``remedy`` says what to do where these are many.
+class _Counted(Enum):
+    """What points or landmarks are counted as, under its value, in :attr:`.Estimator.counts`.
+
+    ``words`` say the same, and ``remedy`` what to do where these are many.
     """
 
     words: str
     remedy: str
+
+    def __new__(cls, name: str, words: str, remedy: str = '') -> Self:
+        """Let the value be the name."""
+        counted = object.__new__(cls)
+        counted._value_, counted.words, counted.remedy = name, words, remedy
+        return counted
+
+
+class Reason(_Counted):
+    """Why a point that was observed is not used: each such point has exactly one reason."""
 
     REJECTED = (
         'rejected_landmark',
@@ -59,18 +71,9 @@ class Reason(Enum):
         'do nothing if the robot carries them; where they stay behind they are used again',
     )
 
-    def __new__(cls, name: str, words: str, remedy: str) -> Reason:
-        """Let a reason's value be its name."""
-        reason = object.__new__(cls)
-        reason._value_ = name
-        reason.words, reason.remedy = words, remedy
-        return reason
 
-
-class Change(Enum):
-    """What became of a landmark itself; the value is the name under which it is counted."""
-
-    words: str
+class Change(_Counted):
+    """What became of a landmark itself."""
 
     FOUND = 'new_landmark', 'new in the map'
     MOVED = 'moved_landmark', 'moved: it is where it was seen now'
@@ -78,12 +81,6 @@ class Change(Enum):
     FORGOTTEN = 'forgotten_landmark', 'forgotten to make room (max_landmarks)'
     UNSUPPORTED = 'unsupported_landmark', 'forgotten: seen too seldom while in view'
     CARRIED = 'carried_landmark', 'moves with the robot'
-
-    def __new__(cls, name: str, words: str) -> Change:
-        """Let a change's value be its name."""
-        change = object.__new__(cls)
-        change._value_, change.words = name, words
-        return change
 
 
 @dataclass(frozen=True, slots=True)

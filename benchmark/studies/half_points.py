@@ -19,7 +19,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.cli.options import find_config
+from slam_observer_ros.cli.convert import surveyed
+from slam_observer_ros.cli.doctor import shipped_settings
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
@@ -28,12 +29,11 @@ from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import BEARING, Event, ObservationEvent, RANGE, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.recording.data_sets import load_plaza
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.parameter_file import read_parameter_file
-from slam_observer_ros.settings.parameter_table import from_parameters, table
 
 DATA = Path(os.environ.get('SLAM_OBSERVER_DATA', '../shared/data')) / 'plaza'
-SURVEY_M, START_M, START_RAD = 0.05, 0.05, 0.05
+START_M, START_RAD = 0.05, 0.05
 STARTS, MOST_M, WRONG_M = 100, 30.0, 2.0
 STEP_S, SPEED = 0.1, 0.7
 
@@ -87,7 +87,7 @@ def lost_on_plaza(run: int) -> Iterator[Found]:
     """Start lost at any time of the first three quarters of a run."""
     events, truth, anchors = read(run)
     for start in np.random.default_rng(1).integers(50, len(events) * 3 // 4, STARTS):
-        yield lost(events[int(start) :], truth, anchors, settings())
+        yield lost(events[int(start) :], truth, anchors, shipped_settings('uwb'))
 
 
 def lost(
@@ -168,7 +168,7 @@ def row(run: int, is_surveyed: bool) -> str:
             off = (update.pose[:3, 3] - truth.poses[at, :3, 3])[:2]
             nees.append(float(off @ np.linalg.solve(covariance[3:5, 3:5], off)) / 2.0)
 
-    estimator = Estimator(settings(), initial_pose=start, on_update=note)
+    estimator = Estimator(shipped_settings('uwb'), initial_pose=start, on_update=note)
     if is_surveyed:
         sigmas = np.array([0.0, 0.0, START_RAD, START_M, START_M, 0.0])
         estimator.load_map(anchors, start, np.diag(sigmas**2))
@@ -183,42 +183,17 @@ def row(run: int, is_surveyed: bool) -> str:
     return f'Plaza {run}, {name:16} ATE {ate_m:.3f} m, ANEES {np.mean(nees):.2f}, {seconds:.1f} s'
 
 
-def settings() -> Settings:
-    """Return what ``uwb.yaml`` says of the estimator."""
-    known = {each.name for each in table(Settings)}
-    values = read_parameter_file(find_config('uwb')).items()
-    return from_parameters(Settings, {key: value for key, value in values if key in known})
-
-
 def read(run: int) -> tuple[list[Event], Trajectory, LandmarkMap]:
-    """Return what was recorded in the order of its stamps, the true poses, and the anchors."""
-    ways, truth, ranges, anchors = (
-        np.loadtxt(DATA / f'plaza{run}_{name}.csv', delimiter=',', skiprows=1)
-        for name in ('dr', 'gt', 'td', 'tl')
-    )
-    turn_rad = np.pi if run == 2 else 0.0  # its truth has the robot's back in front
-    poses = [pose_of(x, y, yaw + turn_rad) for _, x, y, yaw in truth]
-    stamps_ns = [round(1e9 * stamp_s) for stamp_s in truth[:, 0]]
-    events: list[Event] = [
-        VelocityEvent(round(1e9 * t_s), np.array([0, 0, turn, way, 0, 0]) / dt_s, is_mean=True)
-        for t_s, dt_s, (way, turn) in zip(
-            ways[:-1, 0], np.diff(ways[:, 0]), ways[1:, 1:], strict=True
-        )
-        if dt_s > 0.0
-    ]
-    kinds = np.array([RANGE])
-    events += [
-        ObservationEvent(
-            round(1e9 * t_s), np.array([int(anchor)]), np.array([[range_m, 0, 0]]), kinds=kinds
-        )
-        for t_s, _, anchor, range_m in ranges
-    ]
-    events.sort(key=lambda event: event.stamp_ns)
-    n = len(anchors)
-    points = np.column_stack([anchors[:, 1:3], np.zeros(n)])
-    covariances = np.tile(SURVEY_M**2 * np.eye(3), (n, 1, 1))
-    survey = LandmarkMap(anchors[:, 0].astype(np.int64), points, covariances, np.zeros(n, int))
-    return events, Trajectory.from_samples(stamps_ns, poses), survey
+    """Return what was recorded in the order of its stamps, the true poses, and the anchors.
+
+    Velocities are the means over the time until the next, which a TwistStamped can't say.
+    """
+    plaza = load_plaza(DATA, run)
+    velocities = zip(plaza.velocity_stamps_ns.tolist(), plaza.body_velocities, strict=True)
+    events: list[Event] = [VelocityEvent(*each, is_mean=True) for each in velocities]
+    events = sorted([*events, *plaza.observations], key=lambda event: event.stamp_ns)
+    truth = Trajectory(plaza.truth_stamps_ns, plaza.true_poses)
+    return events, truth, surveyed(plaza.landmarks)
 
 
 def pose_of(x: float, y: float, yaw: float) -> FloatArray:

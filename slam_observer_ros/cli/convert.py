@@ -19,7 +19,7 @@ from slam_observer_ros.cli.outputs import (
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.evaluation.trajectory import write_tum
+from slam_observer_ros.evaluation.trajectory import LandmarkTruth, write_tum
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.recording.data_sets import (
@@ -156,17 +156,21 @@ SURVEY_M = 0.05
 """Standard deviation of coordinates of Plaza's radios, which were surveyed by GPS."""
 
 
+def surveyed(landmarks: LandmarkTruth) -> LandmarkMap:
+    """Return the map of Plaza's radios, as uncertain as they were surveyed."""
+    count = len(landmarks.ids)
+    covariances, never = np.tile(SURVEY_M**2 * np.eye(3), (count, 1, 1)), np.zeros(count, np.int64)
+    return LandmarkMap(landmarks.ids, landmarks.world_points, covariances, never)
+
+
 def _run_plaza(args: argparse.Namespace) -> None:
     """Write a run, beside it the survey of its radios, and say where the mower began."""
     survey: Path = args.output.with_suffix('.yaml')
     _check(args, survey)
     data_set = load_plaza(args.folder, args.number)
     rows = _written(args, data_set)
-    anchors, count = data_set.landmarks, len(data_set.landmarks.ids)
-    if count and len(data_set.true_poses):
-        covariances = np.tile(SURVEY_M**2 * np.eye(3), (count, 1, 1))
-        points, never = anchors.world_points, np.zeros(count, dtype=np.int64)
-        write_map(survey, LandmarkMap(anchors.ids, points, covariances, never), None)
+    if len(data_set.landmarks.ids) and len(data_set.true_poses):
+        write_map(survey, surveyed(data_set.landmarks), None)
         start = data_set.true_poses[0]
         yaw = float(np.arctan2(start[1, 0], start[0, 0]))
         rows['survey, and where it begins'] = (

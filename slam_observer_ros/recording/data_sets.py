@@ -98,9 +98,9 @@ def _require_robot(folder: Path, robot: int) -> None:
         raise DataSetError(f'{folder}: no robot {robot}; there are {", ".join(map(str, robots))}')
 
 
-def _truth(path: Path, columns: int) -> FloatArray:
+def _truth(path: Path, columns: int, delimiter: str | None = None) -> FloatArray:
     """Read a table of what is true, which a run may be without."""
-    return _table(path, columns) if path.exists() else np.empty((0, columns))
+    return _table(path, columns, delimiter) if path.exists() else np.empty((0, columns))
 
 
 def _table(path: Path, columns: int, delimiter: str | None = None) -> FloatArray:
@@ -194,9 +194,8 @@ def load_plaza(folder: Path | str, run: int) -> DataSet:
         raise DataSetError(f'{folder}: no such directory; give the one of plaza1_td.csv')
     path = {name: folder / f'plaza{run}_{name}.csv' for name in ('dr', 'gt', 'td', 'tl')}
     way = _table(path['dr'], 3, ',')
-    truth = _table(path['gt'], 4, ',') if path['gt'].exists() else np.empty((0, 4))
+    truth, anchors = _truth(path['gt'], 4, ','), _truth(path['tl'], 3, ',')
     measured = _table(path['td'], 4, ',')
-    anchors = _table(path['tl'], 3, ',') if path['tl'].exists() else np.empty((0, 3))
 
     # A row's way is what was driven since the row before: a mean velocity from there on
     seconds = np.diff(way[:, 0])

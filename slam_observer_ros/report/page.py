@@ -16,7 +16,6 @@ from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.estimates import Reason
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.messages.estimate_messages import half_sights
 from slam_observer_ros.report.curves import (
@@ -261,13 +260,7 @@ def _residuals(run: ReportedRun) -> dict[str, Json]:
 
 def _outcomes(run: ReportedRun) -> dict[str, Json]:
     """Return what became of landmarks, and why points were not used that have no residual."""
-    seen = run.innovations
-    judged = set(zip(seen.stamps_ns.tolist(), seen.ids.tolist(), strict=True))
-    each = [
-        one
-        for one in run.outcomes
-        if one.what is not Reason.REJECTED or (one.stamp_ns, one.landmark_id) not in judged
-    ]
+    each = run.without_residual
     each = each[thinned(len(each), MAX_RESIDUALS)]
     stamps_ns = np.array([one.stamp_ns for one in each], dtype=np.int64)
     return {

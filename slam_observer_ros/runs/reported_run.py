@@ -280,13 +280,22 @@ class ReportedRun:
                 strict=True,
             )
         ]
-        judged_ns = set(seen.stamps_ns[of_it].tolist())
-        others = [each for each in self.outcomes if each.landmark_id == landmark_id]
-        stamps_ns = np.array([each.stamp_ns for each in others], dtype=np.int64)
-        for each, seconds in zip(others, self.seconds(stamps_ns).tolist(), strict=True):
-            if each.what is not Reason.REJECTED or each.stamp_ns not in judged_ns:
+        for each in self.without_residual:
+            if each.landmark_id == landmark_id:
+                seconds = to_s(each.stamp_ns - self.start_ns)
                 lines.append(Sighting(seconds, math.nan, math.nan, each.what.words))
         return sorted(lines, key=lambda line: line.seconds)
+
+    @property
+    def without_residual(self) -> list[Outcome]:
+        """Outcomes that the innovations have not, as they have each residual that was rejected."""
+        seen = self.innovations
+        judged = set(zip(seen.stamps_ns.tolist(), seen.ids.tolist(), strict=True))
+        return [
+            each
+            for each in self.outcomes
+            if each.what is not Reason.REJECTED or (each.stamp_ns, each.landmark_id) not in judged
+        ]
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Return times since the first event of the run, seconds."""
