@@ -21,7 +21,7 @@ import numpy as np
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import outlines
-from slam_observer_ros.evaluation.drawing import PALE_BLUE, RED, STYLE
+from slam_observer_ros.evaluation.figures import PALE_BLUE, RED, STYLE
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.known_map.landmark_map import LandmarkMap

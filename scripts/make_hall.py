@@ -19,7 +19,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.drawing import (
+from slam_observer_ros.evaluation.figures import (
     BLACK,
     BLUE,
     GREEN,

@@ -15,7 +15,7 @@ import pytest
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.evaluation import figures
-from slam_observer_ros.evaluation.drawing import (
+from slam_observer_ros.evaluation.figures import (
     BLACK,
     BLUE,
     GREEN,
