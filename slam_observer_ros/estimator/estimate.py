@@ -19,8 +19,9 @@ from slam_observer_ros.estimates import (
     Smoothed,
     Update,
 )
-from slam_observer_ros.estimator.event_warnings import EventWarnings, Undisturbed
+from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.estimator.timeline import Timeline
+from slam_observer_ros.estimator.undisturbed import Undisturbed
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import Localiser

@@ -25,9 +25,10 @@ from slam_observer_ros.estimator.checks import (
 )
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.estimator.event_queue import EventQueue
-from slam_observer_ros.estimator.event_warnings import Undisturbed, UNEXPECTED_POSES
+from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.estimator.placement import Placement
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
+from slam_observer_ros.estimator.undisturbed import Undisturbed
 from slam_observer_ros.events import (
     Event,
     MeasuredVelocity,

@@ -18,6 +18,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.geometry.matrices import cholesky, mahalanobis
 from slam_observer_ros.known_map.merging import without_frame
 from slam_observer_ros.observer.landmark_table import MIN_LOOP
+from slam_observer_ros.observer.robust import accepted
 from slam_observer_ros.state.state import State
 
 logger = logging.getLogger(__name__)
@@ -122,8 +123,10 @@ class LoopClosure:
     def merge_twins(self, state: State) -> int:
         """Merge landmarks that are as near each other as one would be; return how many."""
         own, merged = _own(state), 0
+        # Per axis, as merge() takes it: at the gate.
+        most = state.settings.rejection_threshold**2 / state.axes.point
         while len(own) > 2 and (pair := self._twins(state, own)) is not None:
-            if state.merge(*pair, _most(state)) > _most(state):
+            if state.merge(*pair, most) > most:
                 break
             own = own[own != pair[1]]
             own -= own > pair[1]
@@ -154,7 +157,7 @@ class LoopClosure:
         if not len(at):
             return
         r, S = _differences(state, absent[at], added[new])
-        differ = mahalanobis(r, S) ** 2 > _most(state) * state.axes.point
+        differ = ~accepted(mahalanobis(r, S), state.settings.rejection_threshold)
         pairs = np.column_stack([landmarks.ids[absent[at]], landmarks.ids[added[new]]])[differ]
         doubled = {(int(old), int(own)) for old, own in pairs} - self._doubled
         state.counts['doubled_landmark'] += len(doubled)
@@ -188,19 +191,15 @@ class LoopClosure:
         at, first, second, alone = at[may_be], first[may_be], second[may_be], alone[may_be]
         # How much likelier it is that they are one, there and not seen side by side.
         r, S = _differences(state, first, second)
-        squares = mahalanobis(r, S) ** 2
+        distances = mahalanobis(r, S)
+        may_be_one = accepted(distances, state.settings.rejection_threshold)
         log_density = np.log(np.maximum(densities[at[:, 0]], densities[at[:, 1]]))
-        odds = -0.5 * (squares + np.linalg.slogdet(2.0 * math.pi * S)[1]) - log_density
+        odds = -0.5 * (distances**2 + np.linalg.slogdet(2.0 * math.pi * S)[1]) - log_density
         odds -= alone * math.log1p(-p)
-        best = int(np.argmax(np.where(squares <= _most(state) * k, odds, -np.inf)))
+        best = int(np.argmax(np.where(may_be_one, odds, -np.inf)))
         is_sure = odds[best] > -math.log(state.settings.localization_error_probability)
-        is_sure &= squares[best] <= _most(state) * k
+        is_sure &= may_be_one[best]
         return (first[[best]], second[[best]]) if is_sure else None
-
-
-def _most(state: State) -> float:
-    """Return the normalised square, per axis, of two landmarks that may be one: at the gate."""
-    return state.settings.rejection_threshold**2 / state.axes.point
 
 
 def _own(state: State) -> IntArray:
