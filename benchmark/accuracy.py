@@ -1,6 +1,6 @@
 """The benchmark of accuracy and consistency: ``make benchmark-accuracy``.
 
-Every estimator gets the same events and the same noise figures, those of config/*.yaml.
+Every estimator gets the same events and the same noise figures, from config/*.yaml.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ State: pose (R, x) and the landmarks' absolute positions p_i, with the errors ta
 
 Every step is linearised around the latest estimate, as in Smith, Self and Cheeseman (1990) and in
 Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), chapter 10. Gate and Huber's weights are
-those of the observer.
+the observer's.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """GTSAM's iSAM2 and its batch optimisation, fed with what the observer gets.
 
 One pose an observation. Odometry between two observations is one ``BetweenFactor`` whose
-covariance is that of the velocities in between; each point seen is a ``BearingRangeFactor`` whose
-standard deviations are those of the observer's noise model along and across the line of sight,
+covariance comes from the velocities in between; each point seen is a ``BearingRangeFactor`` whose
+standard deviations are by the observer's noise model along and across the line of sight,
 under Huber's loss with the observer's threshold. ``Pose2``/``Point2`` in ``two_d_mode``, otherwise
 ``Pose3``/``Point3``. There is no state for the velocity's scale or bias.
 """

@@ -2,7 +2,7 @@
 
 Twist at 50 Hz and clouds of 20 landmarks at 20 Hz go over DDS to one process after the other: a
 subscriber that drops them, a node that publishes each of them again, and the observer. CPU time is
-that of the whole process, by the kernel. Latency is from before a Twist is published here to the
+the whole process's, by the kernel. Latency is from before a Twist is published here to the
 reception here of what comes of it: its echo, or the first odometry that is not older. Nothing
 outside hears of it: the domain is one that nobody has, on this machine alone.
 """

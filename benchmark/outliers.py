@@ -20,7 +20,7 @@ FALSE_SHARE = 0.05
 def with_outliers(world: World, seed: int) -> World:
     """Displace 5 % of the points by 0.5–20 m in any direction, and swap 1 % of the ids.
 
-    An id is swapped for that of another landmark seen before, as when two markers look alike.
+    An id is swapped for another landmark's, which was seen before, as when two markers look alike.
     """
     rng = np.random.default_rng(seed)
     seen: set[int] = set()

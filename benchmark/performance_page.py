@@ -50,7 +50,7 @@ DRAWN: dict[str, Any] = {
 
 
 class Measured(TypedDict):
-    """When and where a part was measured; ``load`` is that of the last minute before."""
+    """When and where a part was measured; ``load`` is the last minute's before."""
 
     date: str
     processor: str

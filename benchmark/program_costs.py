@@ -36,7 +36,7 @@ with AnyReader([Path(sys.argv[1])]) as reader:
 
 
 def measure_replay() -> Tables:
-    """Return the CPU time of ``replay --json`` over that of reading the same recording."""
+    """Return the CPU time of ``replay --json`` over the time to read the same recording."""
     with with_bytecode() as folder:
         recording = Path(folder) / 'robot1.mcap'
         data = worlds.data_folder() / 'mrclam' / 'MRCLAM_Dataset6'
@@ -53,7 +53,7 @@ def measure_replay() -> Tables:
 
 
 def measure_start() -> Tables:
-    """Return the CPU time of ``slam-observer --help`` over that of importing numpy."""
+    """Return the CPU time of ``slam-observer --help`` over the time to import numpy."""
     with with_bytecode():
         turns = take_turns([sys.executable, '-c', 'import numpy'], [*COMMAND, '--help'])
     rows: dict[str, list[float | None]] = {'slam-observer --help': [over_first(turns, 1)]}

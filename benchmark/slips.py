@@ -29,7 +29,7 @@ TURNING_S = 1.5
 
 
 def with_slips(world: World, seed: int, unseen_s: float = 0.0) -> World:
-    """Let wheels spin once a minute, for 1 to 2 s: half of the times those of one side, else all.
+    """Let wheels spin once a minute, for 1 to 2 s: half of the times on one side, else all.
 
     Odometry then reports a turn of 0.3 to 0.8 rad, either way, or of 0.5 to 1 m of way, that the
     robot has not made. Nothing is seen in the first ``unseen_s`` of it.

@@ -41,7 +41,7 @@ ESTIMATORS = ('constant', 'riccati', EKF, ISAM2_DEFAULT, ISAM2)
 
 
 def measure_steps() -> Tables:
-    """Return costs of a step against landmarks known, and seen, in those of the cheapest."""
+    """Return costs of a step against landmarks known, and seen, in units of the cheapest."""
     by_known = {name: [step_s(name, known, FEW_SEEN) for known in KNOWN] for name in ESTIMATORS}
     by_seen = {name: [step_s(name, MANY_KNOWN, seen) for seen in SEEN] for name in ESTIMATORS}
     unit_s = min(values[0] for values in by_known.values())
@@ -101,7 +101,7 @@ def make(name: str, settings: Settings) -> OnlineEstimator:
 
 
 def drive(known: int, seen: int) -> tuple[list[Event], list[list[Event]]]:
-    """Return the events by which all landmarks get known, and those of each step."""
+    """Return the events by which all landmarks get known, and each step's."""
     rng = np.random.default_rng(0)
     side = math.ceil(math.sqrt(known))
     grid = SPACING_M * (np.stack(np.divmod(np.arange(known), side), axis=-1) - 0.5 * side)

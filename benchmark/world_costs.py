@@ -1,6 +1,6 @@
 """What whole runs cost: the benchmark's worlds, and long courses past many landmarks.
 
-The CPU time is that of the estimator's own calls, as in docs/benchmark.md, of one run.
+The CPU time is spent in the estimator's own calls, as in docs/benchmark.md, of one run.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PLANE = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
 
 
 def measure_worlds() -> Tables:
-    """Return the CPU time over that of iSAM2, and of iSAM2 with its defaults, on each world."""
+    """Return the CPU time over iSAM2's, and over iSAM2's with its defaults, on each world."""
     rows: dict[str, list[float | None]] = {}
     totals: dict[str, list[float]] = {}
     for name in worlds.names():
@@ -49,7 +49,7 @@ def measure_worlds() -> Tables:
 
 
 def measure_passing() -> Tables:
-    """Return the CPU time over that of iSAM2 with QR on courses past many landmarks."""
+    """Return the CPU time over iSAM2's with QR on courses past many landmarks."""
     compared = 'riccati', ISAM2_DEFAULT, ISAM2_QR
     rows: dict[str, list[float | None]] = {name: [] for name in compared}
     for passed in PASSED:

@@ -136,6 +136,6 @@ def _consistency(estimated: list[Estimated]) -> tuple[float, float, float]:
 
 
 def _rate_hz(times_s: list[float]) -> float:
-    """Return the median rate over whole seconds in which any came: not those of a restart."""
+    """Return the median rate over whole seconds in which any came: not the ones of a restart."""
     counts = np.bincount(np.array(times_s).astype(int))
     return float(np.median(counts[counts > 0]))

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Make docs/images/reflectors.png: a robot dropped in a hall of reflectors that look alike.
 
-The hall and the scanner are those of ``make robot OPTIONS=--reflectors``. Half-way the robot is
+The hall and the scanner are as in ``make robot OPTIONS=--reflectors``. Half-way the robot is
 carried elsewhere, which its wheels do not notice.
 """
 

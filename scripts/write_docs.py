@@ -240,13 +240,13 @@ def expect_same_names(found: Iterable[str], described: Iterable[str]) -> None:
 
 
 def own_parameters() -> list[Parameter]:
-    """Return the rows that the observer node adds to those of its inputs."""
+    """Return the rows that the observer node adds to its inputs' rows."""
     inherited = table(InputSettings)
     return [row for row in table(ObserverNodeSettings) if row not in inherited]
 
 
 def two_tables(name: str, parameters: Sequence[Parameter]) -> dict[str, str]:
-    """Return the table of what a robot needs first, and that of the advanced parameters."""
+    """Return the tables of what a robot needs first, and of the advanced parameters."""
     return {
         f'{name}-parameters': parameter_table(row for row in parameters if row.basic),
         f'{name}-parameters-advanced': parameter_table(r for r in parameters if not r.basic),

@@ -2,8 +2,8 @@
 
 ``python benchmark/studies/motion_noise.py`` runs each world with the noise of turning and driving
 stated right, three times too small and three times too large, for each ``motion_noise_factor``. A
-row has the configuration error and over that of ``stated``, stated right; ANEES; the factors of
-turning and driving, of standard deviations; CPU time.
+row has the configuration error, also over the one of ``stated``, stated right; ANEES; the factors
+of turning and driving, of standard deviations; CPU time.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ SCORED = ('riccati', 'textbook EKF')
 
 
 def main() -> None:
-    """Print the oracle's error, and that of estimators against both kinds of truth."""
+    """Print the oracle's error, and the estimators' against both kinds of truth."""
     argparse.ArgumentParser(description=__doc__).parse_args()
     recorded = starry_night()
     fitted = fitted_poses(recorded)

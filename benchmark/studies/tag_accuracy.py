@@ -1,6 +1,6 @@
 """How well a wheeled robot is localised among AprilTags, by their number and size, simulated.
 
-``python benchmark/studies/tag_accuracy.py`` prints the table of docs/nav2.md. The hall is that of
+``python benchmark/studies/tag_accuracy.py`` prints the table of docs/nav2.md. The hall is as in
 ``make robot``; a smaller number of tags is every second or every fourth of them.
 """
 
@@ -57,7 +57,7 @@ def cell(every: int, size_m: float, seeds: int, duration_s: float) -> str:
 
 
 def settings(size_m: float) -> Settings:
-    """Return those of the parameter file, with the noise of the range for a tag's size."""
+    """Return the settings of the parameter file, with the noise of the range for a tag's size."""
     known = {row.name for row in table(Settings)}
     given = read_parameter_file(PARAMS_FILE)
     chosen = from_parameters(Settings, {k: v for k, v in given.items() if k in known})

@@ -18,7 +18,7 @@ POSE_JUMP = 'pose_jump'
 """Reason under which a difference of poses is dropped that no robot can have moved by."""
 
 SKIPPED = 'skipped_pose'
-"""Reason under which poses are counted whose motion counts with that of the next one."""
+"""Reason under which poses are counted whose motion counts with the next one's."""
 
 MAX_SPEED = 50.0
 """Beyond this, rad/s or m/s, it was not the robot that moved: its odometry was reset."""

@@ -150,7 +150,7 @@ class LandmarkMap:
 
 
 MAX_PAIRS = 2_000_000
-"""Pairs of landmarks that are kept: all those of 2000, in larger maps those close together."""
+"""Pairs of landmarks that are kept: all among 2000, in larger maps the close ones."""
 
 MAX_TRIPLES = 1_000_000
 """Triangles that are looked at for one of three given sides."""

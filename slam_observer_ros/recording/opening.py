@@ -24,10 +24,10 @@ from slam_observer_ros.recording.sources import (
 )
 
 COMPRESSED = '.zstd'
-"""Suffix of a file that was compressed as a whole, behind that of its format."""
+"""Suffix of a file that was compressed as a whole, behind the one of its format."""
 
 MAX_METADATA_BYTES = 10_000_000
-"""Bytes of a metadata.yaml that is read; that of a thousand files has a tenth of them."""
+"""Bytes of a metadata.yaml that is read; a recording of a thousand files has a tenth of them."""
 
 
 _BLOCK_BYTES = 1 << 20

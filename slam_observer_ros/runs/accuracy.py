@@ -42,7 +42,7 @@ from slam_observer_ros.sensor_models.calibration import (
 logger = logging.getLogger(__name__)
 
 STILL = 1e-12
-"""Change of a pose, m and rad, below which it is that of rounding: a robot at rest has no bias."""
+"""Change of a pose, m and rad, below which it is rounding: a robot at rest has no bias."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,7 +40,7 @@ TOO_LITTLE = 1.5
 """Errors over what is stated, beyond which a noise figure is named."""
 
 LONG_S = 1.0
-"""Time without landmarks after which an innovation is mostly that of the motion."""
+"""Time without landmarks after which an innovation is mostly due to the motion."""
 
 MIN_DEGREES = 60
 """Degrees of freedom of innovations whose mean says something."""

@@ -60,8 +60,8 @@ NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
 """Least delay of velocities that is worth a finding, and by how many of its deviations."""
 
 SHOWN, SURE = 0.25, 4.0
-"""Power of the cosine in ranges, over that of what they are taken for, that is worth a finding,
-and by how many of its deviations."""
+"""Power of the cosine in ranges, beyond the power of what they are taken for, that is worth a
+finding, and by how many of its deviations."""
 
 HARDLY_ANY = 0.25
 """Landmarks in a map, over those seen too seldom for it, below which there is hardly a map."""

@@ -75,7 +75,7 @@ KINDS = {'turning': 'angular', 'driving': 'linear'}
 _IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
 
 PRIOR_DEVIATION = 0.5
-"""Of the logarithm of a factor of the standard deviation at the start: half that of θ."""
+"""Of the logarithm of a factor of the standard deviation at the start: half as for θ."""
 
 
 class MotionFigures(NamedTuple):

@@ -13,7 +13,7 @@ MAX_DELAY_S = 1.0
 """Delay of velocities that is made up for at most."""
 
 MAX_POSITION_M = 1e7
-"""Coordinate of a given pose at most: a map's origin may be that of UTM."""
+"""Coordinate of a given pose at most: a map's origin may be UTM's."""
 
 
 @dataclass(frozen=True)

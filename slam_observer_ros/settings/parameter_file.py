@@ -19,7 +19,7 @@ from slam_observer_ros.settings.parameter_table import (
 OBSERVER_NODE = 'observer_node'
 
 MAX_BYTES = 256_000
-"""Largest file that is read; those of whole robots have a tenth of it."""
+"""Largest file that is read; whole robots' have a tenth of it."""
 
 MAX_NAME = 255
 """Longest name of a node with its namespaces, as in ROS, and of a parameter."""

@@ -322,7 +322,7 @@ def test_a_landmark_that_moved_and_is_seen_alone_seldom_throws_the_pose(settings
 @modes
 @seeds
 def test_a_landmark_that_moved_away_from_beside_the_robot_does_not_throw_the_pose(settings, seed):
-    """Its noise is that of where it is seen now, not of where it was: right at the sensor."""
+    """Its noise belongs to where it is seen now, not to where it was: right at the sensor."""
     rng, estimator, points = np.random.default_rng(seed), Estimator(settings), 4.0 * np.eye(3)
     points[2] = [0.1, 0.0, 0.0]
     for step in range(40):

@@ -56,7 +56,7 @@ def test_where_all_points_lie_in_one_plane_all_of_space_counts_as_in_view():
 def looked_at(counts, looks, settled_looks=0, settled_seen=0):
     """A table of landmarks without ids, after one that has settled was in view and seen so often.
 
-    The landmark of row 0 is that one, the next are those of ``counts`` and ``looks``.
+    The landmark of row 0 is that one, the next have ``counts`` and ``looks``.
     """
     landmarks = LandmarkTable()
     landmarks.append_zeros(1)

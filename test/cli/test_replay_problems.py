@@ -14,7 +14,7 @@ from slam_observer_ros.recording.writer import RecordingWriter
 
 
 def without(kind):
-    """Return events of which those of a kind can't be used."""
+    """Return events of which one kind can't be used."""
     nowhere = {VelocityEvent: 'body_velocity', ObservationEvent: 'points'}
     return [
         replace(

@@ -147,7 +147,7 @@ class Drive:
 
 
 def test_among_reflectors_the_shipped_file_is_as_sure_as_it_may_be():
-    """Or its noise, or that of the hall, would be misstated."""
+    """Or its noise, or the hall's, would be misstated."""
     nees = []
     for seed in range(2):
         drive = Drive('reflectors', seed)

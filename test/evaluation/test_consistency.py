@@ -1,4 +1,4 @@
-"""Consistency: the covariances that are published are those of the errors that are made.
+"""Consistency: the covariances that are published fit the errors that are made.
 
 The benchmark does the same over longer loops and 50 runs.
 """

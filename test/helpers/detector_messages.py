@@ -230,7 +230,7 @@ def linktrack(
     frame_id: str | None = None,
     stamp_ns: int = ros.STAMP_NS,
 ) -> object:
-    """A frame of LinkTrack of (id, distance[, angle]); without ``frame_id`` that of ROS 1."""
+    """A frame of LinkTrack of (id, distance[, angle]); without ``frame_id`` ROS 1's."""
     package = 'nlink_parser' if frame_id is None else 'nlink_parser_ros2_interfaces'
     head = [] if frame_id is None else [ros.header(frame_id, stamp_ns)]
     node = 'LinktrackAoaNode0' if 'Aoa' in frame else 'LinktrackNode2'

@@ -73,7 +73,7 @@ def drive(
 ) -> World:
     """Drive among landmarks and see the nearest few of them.
 
-    The noise is that of the settings times ``noise``. The sensor reports (V − bias) / scale,
+    The noise is as in the settings, times ``noise``. The sensor reports (V − bias) / scale,
     stamped ``delay_ns`` too early.
     """
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""How far numbers are from those of a reference, by the size of these."""
+"""How far numbers are from a reference's, by the size of these."""
 
 from __future__ import annotations
 

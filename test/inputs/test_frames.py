@@ -53,7 +53,7 @@ def test_dynamic_transforms_are_interpolated(share):
 
 @given(st.booleans())
 def test_of_a_fiducial_that_two_cameras_see_each_has_its_own_transform(at_once):
-    """Both name the same frame, which /tf gives one parent: that of whoever came last."""
+    """Both name the same frame, which /tf gives one parent: whoever came last."""
     buffer = TransformBuffer()
     later_ns = SECOND + (0 if at_once else SECOND // 20)
     for stamp_ns in (0, 1, 2):

@@ -157,7 +157,7 @@ class TestSeveralMaps:
 
     @staticmethod
     def halls(is_planar=True, ids=lambda hall: 0):
-        """Three worlds, and their maps; ``ids`` are added to those of each."""
+        """Three worlds, and their maps; ``ids`` are added to the ids of each."""
         worlds = [World(seed, is_planar) for seed in (20, 21, 22)]
         maps = [
             replace(world.map(sigma_m=0.01), ids=np.arange(50) + ids(i), name=f'hall_{i}')

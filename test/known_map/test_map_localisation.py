@@ -331,7 +331,7 @@ def test_of_many_landmarks_the_few_that_fit_by_chance_do_not_place_the_robot(is_
 
 
 def test_a_motion_of_everything_contradicts_nothing_and_one_landmark_that_moved_itself_alone():
-    """What is left is that of the best fitting motion, by generalised least squares."""
+    """What is left fits the best motion, by generalised least squares."""
     rng = np.random.default_rng(0)
     points = rng.normal(scale=5.0, size=(6, 3))
     J = SPATIAL.output_matrix(points).reshape(-1, 6)

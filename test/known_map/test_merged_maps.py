@@ -268,7 +268,7 @@ def test_an_exact_estimate_can_be_brought_into_an_exact_map():
 
 @pytest.mark.parametrize('gains', GAINS)
 def test_a_saved_map_leaves_out_what_moves_and_keeps_what_rests(gains):
-    """A sensor that measures velocities has noise in those of landmarks at rest, too."""
+    """A sensor that measures velocities has noise in velocities of landmarks at rest, too."""
     random = np.random.default_rng(0)
     points, speed = 5.0 * np.eye(4, 3) + [[1.0, 1.0, 0.0]], np.zeros((4, 3))
     speed[2, 0] = 0.5

@@ -251,7 +251,7 @@ def test_stamps_from_another_clock_are_reported_and_corrected_if_asked(ros, tmp_
 
 
 class AnotherClock:
-    """A robot whose clock, and that of its /tf, is behind; it stands and sees one landmark."""
+    """A robot whose clock, and /tf's, is behind; it stands and sees one landmark."""
 
     def __init__(self, behind_ns, **parameters):
         self.behind_ns = behind_ns

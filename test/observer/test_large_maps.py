@@ -104,7 +104,7 @@ class World:
         return y + self.flat(0.05 * self.rng.standard_normal(y.shape))
 
     def look(self, filters):
-        """Observe those of the landmarks in view that are known; add those that are not."""
+        """Observe the landmarks in view that are known; add those that are not."""
         distances = np.linalg.norm(self.points - self.pose[:3, 3], axis=1)
         near = np.flatnonzero(distances < VIEW_M)[:4]
         known = np.array([i for i in near if i in self.ids], dtype=np.int64)

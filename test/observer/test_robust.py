@@ -57,7 +57,7 @@ def test_threshold_zero_is_plain_least_squares(rng):
 
 @given(generators())
 def test_reweighted_least_squares_ends_at_hubers_estimate(rng):
-    """Weights are those of what is left of the residuals once the correction is made."""
+    """Weights are by what is left of the residuals once the correction is made."""
     r, predicted, noise = random_problem(rng)
     r[0] *= 5.0
     settings = Settings(huber_threshold=1.345, rejection_threshold=1e9)

@@ -106,7 +106,7 @@ def test_launch_commands_name_existing_files_and_arguments(page):
 
 
 def launch_arguments(file):
-    """Return the names of a launch file's arguments, with those of a file that it includes."""
+    """Return the names of a launch file's arguments, with the ones of a file that it includes."""
     tree = ast.parse((CHECKOUT / 'launch' / file).read_text())
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     names = {

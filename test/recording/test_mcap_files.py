@@ -30,7 +30,7 @@ def run(count=300):
 
 
 def write(path, messages=None, chunk_size=3000, extras=(), **options):
-    """Write messages as they come; ``options`` are those of the writer."""
+    """Write messages as they come; ``options`` are the writer's."""
     with path.open('wb') as file:
         writer = Writer(file, chunk_size, **options)
         writer.start('ros2', 'test')

@@ -127,7 +127,7 @@ def test_what_is_logged_below_the_command_line_is_a_finding(folder):
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_what_a_remedy_says_to_set_can_be_set(kind):
-    """Names of parameters are those of the tables, and values fit them."""
+    """Names of parameters are the tables', and values fit them."""
     rows = {row.name: row for owner in (Settings, ObserverNodeSettings) for row in table(owner)}
     remedy = KINDS[kind].remedy
     for name, value in re.findall(r'\b([a-z]+(?:_[a-z]+)+): (\w[\w.]*)', remedy):

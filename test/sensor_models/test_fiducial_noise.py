@@ -1,4 +1,4 @@
-"""Noise of tags from that of their corners: by simulated images, by formulas where frontal."""
+"""Noise of tags from their corners' noise: by simulated images, by formulas where frontal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of residuals: their density is that of a normal distribution, all together."""
+"""What is said of residuals: their density is a normal distribution's, all together."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 SLACK = 0.5
 """Part of the period by which a state of the input that sets the pace may come early, as inputs
-jitter, and by which those of others wait for it."""
+jitter, and by which other inputs wait for it."""
 
 
 class Pace:
