@@ -43,12 +43,12 @@ setup(
         Extension(
             f'{PACKAGE}.{folder}.{name}',
             [f'{PACKAGE}/{folder}/{name}.c'],
-            depends=glob(f'{PACKAGE}/observer/_*.h'),
+            depends=glob(f'{PACKAGE}/filter/_*.h'),
             define_macros=[('SOURCES', COMPILED['digest_of_sources'](f'{folder}.{name}'))],
             extra_compile_args=['-O3', '-fno-math-errno'],
             optional=True,  # without a compiler numpy does the same
         )
-        for folder, name in (('observer', '_core'), ('smoothing', '_gauss_newton'))
+        for folder, name in (('filter', '_core'), ('smoothing', '_gauss_newton'))
     ],
     zip_safe=False,
     python_requires='>=3.10',

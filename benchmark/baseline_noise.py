@@ -7,11 +7,11 @@ import numpy as np
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry.axes import SPATIAL
-from slam_observer_ros.observer.arrays import FilterArrays
-from slam_observer_ros.sensor_models import sensing
-from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
+from slam_observer_ros.filter.arrays import FilterArrays
+from slam_observer_ros.lie.axes import SPATIAL
+from slam_observer_ros.models import sensing
+from slam_observer_ros.models.calibration import Calibration, without_calibration
+from slam_observer_ros.models.observation_noise import ObservationNoise, repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 

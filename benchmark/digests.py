@@ -28,7 +28,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import DESIGNS
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 
 MAP_NOISE_M = 0.03
 """Standard deviation of the surveyed map in which a run is localised, metres."""

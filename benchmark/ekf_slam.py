@@ -17,10 +17,10 @@ from odometry import Event, Odometry
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.geometry.matrices import block_diagonal
-from slam_observer_ros.observer.robust import observation_weights
+from slam_observer_ros.filter.robust import observation_weights
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import PLANAR, SPATIAL
+from slam_observer_ros.lie.matrices import block_diagonal
 from slam_observer_ros.settings.estimator_settings import Settings
 
 

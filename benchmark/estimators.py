@@ -16,8 +16,8 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import DESIGNS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.sensor_models.calibration import without_calibration
+from slam_observer_ros.lie import se3
+from slam_observer_ros.models.calibration import without_calibration
 from slam_observer_ros.settings.estimator_settings import Settings
 
 DEAD_RECKONING = 'dead reckoning'

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.nodes.ros_interface import MESSAGES
 

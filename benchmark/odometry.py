@@ -8,9 +8,9 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.sensor_models.motion_noise import MotionNoise
-from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.lie import se3
+from slam_observer_ros.models.motion_noise import MotionNoise
+from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 
 Event: TypeAlias = VelocityEvent | ObservationEvent

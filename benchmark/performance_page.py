@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import numpy as np
 import worlds
 
-from slam_observer_ros.evaluation.figures import BLACK, GREEN, PURPLE, RED, save, STYLE
+from slam_observer_ros.runs.figures import BLACK, GREEN, PURPLE, RED, save, STYLE
 
 FIGURES = worlds.CHECKOUT / 'benchmark' / 'performance.json'
 PAGE = worlds.CHECKOUT / 'docs' / 'performance.md'

@@ -24,7 +24,7 @@ from variants import CLEAN, FALSE_POINTS, LEFT_OUT, NO_IDS, OUTLIER_COLUMNS, OUT
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.placement import DESIGNS
-from slam_observer_ros.evaluation.figures import BLACK, BLUE, GREEN, RED, save, STYLE
+from slam_observer_ros.runs.figures import BLACK, BLUE, GREEN, RED, save, STYLE
 
 LEFT_OUT_COLUMN = 'riccati, these points left out'
 GROWTH_COLUMNS = (*OUTLIER_COLUMNS, 'riccati' + WORST, LEFT_OUT_COLUMN)

@@ -9,13 +9,13 @@ from estimators import Run, Snapshot
 import numpy as np
 from worlds import World
 
-from slam_observer_ros.evaluation.metrics import (
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
+from slam_observer_ros.runs.metrics import (
     ConfigurationError,
     landmark_errors,
     trajectory_errors,
 )
-from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import ObservationEvent
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from odometry import Event
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.placement import DESIGNS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 
 KNOWN = (10, 30, 100, 300, 1000)

@@ -18,7 +18,7 @@ from step_costs import ISAM2_QR, make, POINT_NOISE_M, settings_for
 import worlds
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PASSED = (800, 2000)

@@ -14,15 +14,15 @@ import numpy as np
 from odometry import Event
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth, Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.data_sets import load_mrclam, load_starry_night
-from slam_observer_ros.recording.graph_files import load_graph
-from slam_observer_ros.recording.writer import DataSet
-from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.motion_noise import MotionNoise
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.models.held_velocities import HeldVelocities
+from slam_observer_ros.models.motion_noise import MotionNoise
+from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.recordings.data_sets import load_mrclam, load_starry_night
+from slam_observer_ros.recordings.graph_files import load_graph
+from slam_observer_ros.recordings.trajectory import LandmarkTruth, Trajectory
+from slam_observer_ros.recordings.writer import DataSet
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table

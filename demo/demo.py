@@ -27,7 +27,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.common.process import StopSignal
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.writer import RecordingWriter
 
 NodeContext: TypeAlias = AbstractContextManager['subprocess.Popen[bytes]']
 

@@ -18,7 +18,6 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.clouds import decode_point_cloud, decode_point_cloud2
 from slam_observer_ros.messages.poses import (
@@ -26,7 +25,8 @@ from slam_observer_ros.messages.poses import (
     decode_pose_with_covariance_stamped,
 )
 from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, TFMessage
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.trajectory import associate, Trajectory
+from slam_observer_ros.recordings.writer import RecordingWriter
 
 CAUGHT_UP_NS = 500_000_000  # lag of an estimate at the end: the last events are held back
 

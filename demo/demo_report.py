@@ -11,9 +11,9 @@ from rich.console import Console
 from slam_observer_ros.cli.console import table_of
 from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.figures import plot_configuration, plot_lyapunov
-from slam_observer_ros.evaluation.metrics import Decay, fit_decay, trajectory_errors
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.recordings.trajectory import Trajectory
+from slam_observer_ros.runs.figures import plot_configuration, plot_lyapunov
+from slam_observer_ros.runs.metrics import Decay, fit_decay, trajectory_errors
 
 CHECKED_S = 60.0  # simulated time at which the observer must have converged
 CONVERGED_LOG10 = -10.0  # log10 L below which it has

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
 
 SPACING_M, COLUMNS, ROWS = 1.0, 9, 5
 CORNERS = ((0, 0), (8, 0), (8, 2), (3, 2), (3, 4), (0, 4))

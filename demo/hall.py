@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
 
 LAP_S = 48.0
 """Simulated time for one lap about the hall, at about half a metre a second."""

@@ -33,9 +33,9 @@ from robot_report import Interruption, report
 
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.common.process import StopSignal
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import write_map
+from slam_observer_ros.lie import so3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import write_map
 from slam_observer_ros.nodes.launch_setup import command_line, EXECUTABLE
 from slam_observer_ros.settings.estimator_settings import Settings
 

@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.consistency import outlines
-from slam_observer_ros.evaluation.figures import PALE_BLUE, RED, STYLE
-from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.data_sets import load_mrclam
-from slam_observer_ros.recording.writer import DataSet
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.data_sets import load_mrclam
+from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
+from slam_observer_ros.recordings.writer import DataSet
+from slam_observer_ros.runs.consistency import outlines
+from slam_observer_ros.runs.figures import PALE_BLUE, RED, STYLE
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters

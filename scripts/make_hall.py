@@ -19,7 +19,9 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.figures import (
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.runs.figures import (
     BLACK,
     BLUE,
     GREEN,
@@ -29,8 +31,6 @@ from slam_observer_ros.evaluation.figures import (
     save,
     STYLE,
 )
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.simulation import Scenario, Simulation
 
 PATH = Path(__file__).resolve().parent.parent / 'samples' / 'sample.mcap'

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from slam_observer_ros.common.process import use_one_thread
     from slam_observer_ros.estimator.estimator import Estimator
     from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
-    from slam_observer_ros.known_map.landmark_map import LandmarkMap
+    from slam_observer_ros.mapping.landmark_map import LandmarkMap
     from slam_observer_ros.settings.estimator_settings import Settings
 
 __version__ = common.__version__
@@ -29,7 +29,7 @@ __all__ = [
 _MODULES = {
     'AngularVelocityEvent': 'events',
     'Estimator': 'estimator.estimator',
-    'LandmarkMap': 'known_map.landmark_map',
+    'LandmarkMap': 'mapping.landmark_map',
     'ObservationEvent': 'events',
     'Settings': 'settings.estimator_settings',
     'VelocityEvent': 'events',

@@ -17,9 +17,9 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
-from slam_observer_ros.geometry.sensor_mounting import Sensed
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.matrices import limited, MAX_DEVIATION
+from slam_observer_ros.lie.sensor_mounting import Sensed
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""

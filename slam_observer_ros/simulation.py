@@ -16,9 +16,9 @@ import numpy as np
 
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
+from slam_observer_ros.recordings.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.settings.parameter_table import parameter
 
 BODY_VELOCITY = (0.0, 0.0, 0.2, 1.0, 0.0, 0.0)

@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
+from slam_observer_ros.recordings.trajectory import PoseTruth
 from slam_observer_ros.settings.parameter_table import from_parameters
 from slam_observer_ros.simulation import Delivery, LAP_S, Scenario, SimulatedEvent, Simulation
 

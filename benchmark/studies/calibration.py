@@ -28,13 +28,13 @@ from slam_observer_ros.cli.held_out import Material
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.consistency import anchored_average_nees
-from slam_observer_ros.evaluation.metrics import ConfigurationError
-from slam_observer_ros.evaluation.trajectory import interpolate, LandmarkTruth, Trajectory
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.recorded_truth import Truth
+from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory
+from slam_observer_ros.runs.consistency import anchored_average_nees
+from slam_observer_ros.runs.metrics import ConfigurationError
 
 LOOPS = {
     'plane': Loop('wheeled_bearing_range', 60.0, 150.0, 20, 6.0, 5),

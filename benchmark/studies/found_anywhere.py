@@ -24,10 +24,10 @@ import worlds
 from slam_observer_ros.common.process import use_one_thread
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.trajectory import interpolate
 
 ROBOTS = 5
 LIMIT_S = 240.0

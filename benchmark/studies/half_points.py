@@ -24,12 +24,12 @@ from slam_observer_ros.cli.doctor import shipped_settings
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import trajectory_errors
-from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import BEARING, Event, ObservationEvent, RANGE, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.data_sets import load_plaza
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.data_sets import load_plaza
+from slam_observer_ros.recordings.trajectory import Trajectory
+from slam_observer_ros.runs.metrics import trajectory_errors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 DATA = Path(os.environ.get('SLAM_OBSERVER_DATA', '../shared/data')) / 'plaza'

@@ -13,10 +13,10 @@ import worlds
 from worlds import Loop, World
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.sensor_models.calibration import without_calibration
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.models.calibration import without_calibration
+from slam_observer_ros.recordings.trajectory import LandmarkTruth
 from slam_observer_ros.settings.estimator_settings import Settings
 
 DURATION_S = 120.0

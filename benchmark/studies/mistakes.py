@@ -27,7 +27,7 @@ import worlds
 from worlds import World
 
 from slam_observer_ros.events import Event, ObservationEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.runs.corrections import Correction, OPTICAL
 from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.settings.estimator_settings import Settings

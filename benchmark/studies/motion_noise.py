@@ -22,9 +22,9 @@ import worlds
 from worlds import World
 
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import ConfigurationError
-from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.recordings.trajectory import interpolate
+from slam_observer_ros.runs.metrics import ConfigurationError
 from slam_observer_ros.settings.estimator_settings import Settings
 
 WORLDS = ('simulated loop, wheeled', 'simulated loop, 3D stereo', 'cityTrees10000')

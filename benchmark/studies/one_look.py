@@ -15,11 +15,11 @@ import time
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import EstimatedAxes, PLANAR, SPATIAL
-from slam_observer_ros.known_map.constellation import find_places
-from slam_observer_ros.known_map.landmark_map import MappedLandmarks
-from slam_observer_ros.known_map.places import Anywhere, Constellation, Place
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import EstimatedAxes, PLANAR, SPATIAL
+from slam_observer_ros.mapping.constellation import find_places
+from slam_observer_ros.mapping.landmark_map import MappedLandmarks
+from slam_observer_ros.mapping.places import Anywhere, Constellation, Place
 
 ERROR_PROBABILITY = 1e-3
 DENSITY = 0.03  # reflectors per m²: one in 33 m², as in a hall for laser-guided vehicles

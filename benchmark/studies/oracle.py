@@ -18,11 +18,11 @@ from scores import score
 from worlds import starry_night, World
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.se3 import rigid_alignment
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.se3 import rigid_alignment
+from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.recordings.trajectory import Trajectory
 
 LEAST_SEEN = 4
 """Points in an image from which on a pose is fitted: three leave nothing over to average."""

@@ -26,16 +26,16 @@ from worlds import drive, Loop, simulated_settings, World
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.consistency import normalised_squared_errors
-from slam_observer_ros.evaluation.metrics import ConfigurationError, pose_errors
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
-from slam_observer_ros.geometry.se3 import rigid_alignment
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_map, write_map
-from slam_observer_ros.sensor_models.calibration import without_calibration
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import axes_of
+from slam_observer_ros.lie.matrices import diagonal_blocks, transpose
+from slam_observer_ros.lie.se3 import rigid_alignment
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import read_map, write_map
+from slam_observer_ros.models.calibration import without_calibration
+from slam_observer_ros.runs.consistency import normalised_squared_errors
+from slam_observer_ros.runs.metrics import ConfigurationError, pose_errors
 
 MAPPED_S, LOCALISED_S, CHECKPOINT_S = 50.0, 60.0, 2.0
 

@@ -22,12 +22,12 @@ from worlds import drive, Loop, simulated_settings, World
 from slam_observer_ros.common.process import use_one_thread
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.sensor_models.calibration import without_calibration
+from slam_observer_ros.lie import so3
+from slam_observer_ros.models.calibration import without_calibration
+from slam_observer_ros.runs.metrics import ConfigurationError
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.step import flipped
+from slam_observer_ros.tracking.step import flipped
 
 MAX_SEEN = (1, 2, 5)
 SIGMAS_RAD = (0.02, 0.05, 0.15)

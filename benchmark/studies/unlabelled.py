@@ -29,10 +29,10 @@ from worlds import World
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
-from slam_observer_ros.evaluation.metrics import ConfigurationError
-from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.recordings.trajectory import interpolate
 from slam_observer_ros.runs.health import of_estimate, of_map_without_ids, of_rejections
+from slam_observer_ros.runs.metrics import ConfigurationError
 
 NEES_EVERY = 10
 """Observations from one covariance of the configuration to the next: these cost O(n³)."""

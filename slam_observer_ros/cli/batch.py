@@ -43,8 +43,8 @@ from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import IncompleteError, OutputError, UsageError
 from slam_observer_ros.common.files import destination
-from slam_observer_ros.evaluation.trajectory import write_tum
-from slam_observer_ros.recording.opening import sha256_of
+from slam_observer_ros.recordings.opening import sha256_of
+from slam_observer_ros.recordings.trajectory import write_tum
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)

@@ -30,7 +30,7 @@ from slam_observer_ros.common import __version__
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError, shown, UsageError
 from slam_observer_ros.common.files import not_special, unfinished_file
-from slam_observer_ros.known_map.map_file import map_files
+from slam_observer_ros.mapping.map_file import map_files
 from slam_observer_ros.runs.accuracy import FIGURES
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings

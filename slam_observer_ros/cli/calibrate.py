@@ -49,10 +49,10 @@ from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_map
-from slam_observer_ros.recording.opening import files_of
-from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import read_map
+from slam_observer_ros.recordings.opening import files_of
+from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.runs.health import of_mounting, of_noise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings

@@ -24,10 +24,10 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.lie.axes import axes_of
+from slam_observer_ros.models.calibration import OF_VELOCITY
+from slam_observer_ros.models.sensing import cosines, LEAST_COSINE
 from slam_observer_ros.runs.accuracy import Likelihood
-from slam_observer_ros.sensor_models.calibration import OF_VELOCITY
-from slam_observer_ros.sensor_models.sensing import cosines, LEAST_COSINE
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.settings.parameter_table import Value
 

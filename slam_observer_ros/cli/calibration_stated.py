@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from slam_observer_ros.cli.noise_search import NoiseFactor, of_motion, rounded, scaled
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.sensor_models.calibration import Entry, OF_SENSOR, OF_VELOCITY
+from slam_observer_ros.lie import so3
+from slam_observer_ros.models.calibration import Entry, OF_SENSOR, OF_VELOCITY
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings, Pose6
 

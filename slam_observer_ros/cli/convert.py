@@ -19,20 +19,20 @@ from slam_observer_ros.cli.outputs import (
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth, write_tum
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import write_map
-from slam_observer_ros.recording.data_sets import (
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import write_map
+from slam_observer_ros.recordings.data_sets import (
     load_mrclam,
     load_plaza,
     load_starry_night,
     MEASURES,
 )
-from slam_observer_ros.recording.graph_files import load_graph
-from slam_observer_ros.recording.opening import files_of
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.topics import pose_topic
-from slam_observer_ros.recording.writer import DataSet, write_data_set
+from slam_observer_ros.recordings.graph_files import load_graph
+from slam_observer_ros.recordings.opening import files_of
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.topics import pose_topic
+from slam_observer_ros.recordings.trajectory import LandmarkTruth, write_tum
+from slam_observer_ros.recordings.writer import DataSet, write_data_set
 
 logger = logging.getLogger(__name__)
 

@@ -33,12 +33,12 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_maps
+from slam_observer_ros.filter import core
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import read_maps
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
-from slam_observer_ros.observer import core
-from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.runs.health import of_half_points
 from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.settings.estimator_settings import Settings

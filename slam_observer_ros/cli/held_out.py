@@ -14,11 +14,11 @@ from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.opening import sha256_of
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.lie.axes import axes_of
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.opening import sha256_of
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.recorded_truth import Truth
 from slam_observer_ros.runs.accuracy import Likelihood, LikelihoodRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -10,16 +10,16 @@ import numpy as np
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.options import named, named_path
 from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
-from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.known_map.map_alignment import Likeness
-from slam_observer_ros.known_map.map_check import (
+from slam_observer_ros.lie.axes import axes_of
+from slam_observer_ros.mapping.map_alignment import Likeness
+from slam_observer_ros.mapping.map_check import (
     look_around,
     Looks,
     place_for_another,
     symmetries,
 )
-from slam_observer_ros.known_map.map_file import read_map, write_map
-from slam_observer_ros.known_map.map_import import import_map, LENGTHS, TAG_AXES
+from slam_observer_ros.mapping.map_file import read_map, write_map
+from slam_observer_ros.mapping.map_import import import_map, LENGTHS, TAG_AXES
 from slam_observer_ros.settings.estimator_settings import Settings
 
 
@@ -166,7 +166,7 @@ def _check(args: argparse.Namespace) -> None:
     print_table(str(args.file), values)
     if args.plot:
         # matplotlib takes half a second to import.
-        from slam_observer_ros.evaluation.figures import plot_map_check
+        from slam_observer_ros.runs.figures import plot_map_check
 
         too_few = looks.fitting == 0
         places = looks.poses[:, :3, 3]

@@ -25,10 +25,10 @@ from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import LossError, OutputError, UsageError
 from slam_observer_ros.estimates import point_share, Reason, used_points
 from slam_observer_ros.estimator.event_warnings import listed
-from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.recording.opening import sha256_of
+from slam_observer_ros.recordings.opening import sha256_of
 from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, figure_text
 from slam_observer_ros.runs.input_health import list_dropped
+from slam_observer_ros.runs.metrics import TrajectoryErrors
 from slam_observer_ros.runs.reported_run import Replay, Sighting
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names

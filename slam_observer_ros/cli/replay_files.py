@@ -13,9 +13,9 @@ from slam_observer_ros.cli.outputs import check_inputs_are_kept, check_outputs, 
 from slam_observer_ros.cli.replay_outcome import ReplayOutcome
 from slam_observer_ros.cli.replay_request import Records
 from slam_observer_ros.common.errors import SlamObserverError, UsageError
-from slam_observer_ros.evaluation.trajectory import write_tum
-from slam_observer_ros.known_map.map_file import map_files, write_map
-from slam_observer_ros.recording.opening import files_of
+from slam_observer_ros.mapping.map_file import map_files, write_map
+from slam_observer_ros.recordings.opening import files_of
+from slam_observer_ros.recordings.trajectory import write_tum
 
 logger = logging.getLogger(__name__)
 

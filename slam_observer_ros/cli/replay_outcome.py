@@ -13,12 +13,11 @@ from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.common.findings import Finding, found, Level
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
-from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.recorded_truth import Truth
-from slam_observer_ros.recording.sources import Loss, NOTHING_LOST
-from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.recorded_truth import Truth
+from slam_observer_ros.recordings.sources import Loss, NOTHING_LOST
+from slam_observer_ros.recordings.topics import SelectedTopics
+from slam_observer_ros.recordings.trajectory import Trajectory
 from slam_observer_ros.runs.accuracy import (
     Accuracy,
     measure,
@@ -39,6 +38,7 @@ from slam_observer_ros.runs.health import (
     of_rejections,
 )
 from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
+from slam_observer_ros.runs.metrics import TrajectoryErrors
 from slam_observer_ros.runs.reported_run import NisTally, Replay, ReportedRun, RunRecorder
 from slam_observer_ros.settings.input_settings import InputSettings
 

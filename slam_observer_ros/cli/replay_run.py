@@ -17,9 +17,9 @@ from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import is_automatic
 from slam_observer_ros.estimates import Reason
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.topics import SelectedTopics
 from slam_observer_ros.runs.input_health import of_use
 from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.runs.replay import replay
@@ -28,7 +28,7 @@ from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 if TYPE_CHECKING:
-    from slam_observer_ros.recording.writer import RecordingWriter
+    from slam_observer_ros.recordings.writer import RecordingWriter
     from slam_observer_ros.runs.estimate_writer import EstimateWriter
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ def replayed(request: ReplayRequest, *, shows_progress: bool = True) -> tuple[Re
         )
     maps: Sequence[LandmarkMap] = ()
     if request.load_map is not None:
-        from slam_observer_ros.known_map.map_file import read_maps  # which few runs need
+        from slam_observer_ros.mapping.map_file import read_maps  # which few runs need
 
         maps = read_maps(request.load_map)
     outcome = _replay(request, maps, shows_progress)
@@ -192,7 +192,7 @@ def _estimate_writer(
     if records.mcap is None:
         yield None
         return
-    from slam_observer_ros.recording.writer import RecordingWriter  # a while to import
+    from slam_observer_ros.recordings.writer import RecordingWriter  # a while to import
     from slam_observer_ros.runs.estimate_writer import EstimateWriter
 
     base_frame = inputs.base_frame or InputSettings().base_frame

@@ -28,10 +28,10 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import Decay, fit_decay
-from slam_observer_ros.evaluation.trajectory import PoseTruth, Trajectory
-from slam_observer_ros.observer.observer import lyapunov
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.filter.observer import lyapunov
+from slam_observer_ros.recordings.trajectory import PoseTruth, Trajectory
+from slam_observer_ros.recordings.writer import RecordingWriter
+from slam_observer_ros.runs.metrics import Decay, fit_decay
 from slam_observer_ros.runs.sampling import PoseSamples
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import from_parameters, table
@@ -241,7 +241,7 @@ def _record(simulation: Simulation, path: Path, force: bool) -> None:
 
 def _draw(simulation: Simulation, result: SimulatedRun, directory: Path, suffix: str) -> None:
     # matplotlib takes longer to import than the simulation
-    from slam_observer_ros.evaluation.figures import (
+    from slam_observer_ros.runs.figures import (
         plot_configuration,
         plot_lyapunov,
     )

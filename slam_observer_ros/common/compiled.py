@@ -39,5 +39,5 @@ def digest_of_sources(name: str) -> int | None:
     source = (PACKAGE / name.replace('.', '/')).with_suffix('.c')
     if not source.exists():
         return None
-    headers = sorted((PACKAGE / 'observer').glob('_*.h'))
+    headers = sorted((PACKAGE / 'filter').glob('_*.h'))
     return zlib.crc32(b''.join(path.read_bytes() for path in (source, *headers)))

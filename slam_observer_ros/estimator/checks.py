@@ -32,11 +32,11 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import are_covariances, MAX_DEVIATION, transpose
-from slam_observer_ros.known_map.landmark_map import check_joint, LandmarkMap, MAX_NUMBER
-from slam_observer_ros.observer.gains import Gains
-from slam_observer_ros.observer.landmark_table import LandmarkTable
+from slam_observer_ros.filter.gains import Gains
+from slam_observer_ros.filter.landmark_table import LandmarkTable
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import are_covariances, MAX_DEVIATION, transpose
+from slam_observer_ros.mapping.landmark_map import check_joint, LandmarkMap, MAX_NUMBER
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
 
 ROTATION_TOLERANCE = 1e-3

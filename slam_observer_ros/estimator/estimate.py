@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import (
@@ -22,13 +21,14 @@ from slam_observer_ros.estimates import (
 from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.estimator.timeline import Timeline
 from slam_observer_ros.estimator.undisturbed import Undisturbed
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import Localiser
-from slam_observer_ros.known_map.merging import map_of
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.localiser import Localiser
+from slam_observer_ros.mapping.merging import map_of
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.half_points import HalfPoints
-from slam_observer_ros.state.state import State
+from slam_observer_ros.tracking.half_points import HalfPoints
+from slam_observer_ros.tracking.hypotheses import Hypotheses
+from slam_observer_ros.tracking.state import State
 
 
 class Estimate:

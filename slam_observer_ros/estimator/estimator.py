@@ -37,11 +37,11 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityBlock,
 )
-from slam_observer_ros.known_map.landmark_map import heights_of, LandmarkMap
-from slam_observer_ros.known_map.loop_closure import LoopClosure
+from slam_observer_ros.mapping.landmark_map import heights_of, LandmarkMap
+from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import checked, table
-from slam_observer_ros.state.half_points import judged
+from slam_observer_ros.tracking.half_points import judged
 
 logger = logging.getLogger(__name__)
 

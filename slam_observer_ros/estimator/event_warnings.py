@@ -15,12 +15,12 @@ from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.gains import Gains
+from slam_observer_ros.filter.gains import Gains
+from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import changed_names
-from slam_observer_ros.state.matching import is_contradiction, SAME_POSITION
-from slam_observer_ros.state.state import State
+from slam_observer_ros.tracking.matching import is_contradiction, SAME_POSITION
+from slam_observer_ros.tracking.state import State
 
 logger = logging.getLogger(__name__)
 

@@ -7,20 +7,20 @@ import logging
 
 import numpy as np
 
-from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Outcomes, Update
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import is_rough, Localiser
-from slam_observer_ros.observer.constant import ConstantGains
-from slam_observer_ros.observer.gains import Gains
-from slam_observer_ros.observer.riccati.riccati import RiccatiGains
+from slam_observer_ros.filter.constant import ConstantGains
+from slam_observer_ros.filter.gains import Gains
+from slam_observer_ros.filter.riccati.riccati import RiccatiGains
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.localiser import is_rough, Localiser
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
-from slam_observer_ros.state.state import State
-from slam_observer_ros.state.waiting_room import Window
+from slam_observer_ros.tracking.hypotheses import Hypotheses
+from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.waiting_room import Window
 
 logger = logging.getLogger(__name__)
 

@@ -16,17 +16,17 @@ from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import MeasuredVelocity, ObservationEvent, VelocityBlock
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import SPATIAL
-from slam_observer_ros.geometry.matrices import transpose
-from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.integration import transition, transition_covariance
-from slam_observer_ros.sensor_models.motion_noise import beyond_driving
-from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.axes import SPATIAL
+from slam_observer_ros.lie.matrices import transpose
+from slam_observer_ros.models.held_velocities import HeldVelocities
+from slam_observer_ros.models.integration import transition, transition_covariance
+from slam_observer_ros.models.motion_noise import beyond_driving
+from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
-from slam_observer_ros.state.covariances import of_moved_pose
-from slam_observer_ros.state.matching import point_covariances
-from slam_observer_ros.state.state import State
+from slam_observer_ros.tracking.covariances import of_moved_pose
+from slam_observer_ros.tracking.matching import point_covariances
+from slam_observer_ros.tracking.state import State
 
 OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
 """Called with velocities, and with the stamps of a motion along them: start and end, ns."""

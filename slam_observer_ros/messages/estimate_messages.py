@@ -20,7 +20,7 @@ from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import AZIMUTH, BEARING, RANGE
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.lie import so3
 from slam_observer_ros.messages.cdr import ENCAPSULATION_BYTES, encode_string
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 

@@ -14,7 +14,7 @@ import numpy as np
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import AZIMUTH_RANGE, MAX_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.lie import so3
 from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.clouds import is_measured, observed_ranges
 from slam_observer_ros.messages.registry import reads

@@ -17,7 +17,7 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import BEARING, MAX_ID, POINT, RANGE, UNKNOWN_ID
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.lie import so3
 from slam_observer_ros.messages.cdr import encode_string
 from slam_observer_ros.messages.clouds import (
     COVARIANCE_NAMES,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import AngularVelocityEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.registry import Decoder, reads
 

@@ -25,9 +25,9 @@ from slam_observer_ros.common.stamps import is_of_1970, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import GIVEN_POSE_STD
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import are_covariances, limited
-from slam_observer_ros.known_map.landmark_map import MAX_NUMBER
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import are_covariances, limited
+from slam_observer_ros.mapping.landmark_map import MAX_NUMBER
 from slam_observer_ros.messages.poses import decode_pose_with_covariance_stamped, PoseMessage
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.lateness import FUTURE_NS
@@ -36,7 +36,7 @@ from slam_observer_ros.nodes.map_services import absolute, is_there
 from slam_observer_ros.nodes.ros_interface import RELIABLE_QOS
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
-from slam_observer_ros.state.covariances import MAX_POSE_ERRORS, of_moved_pose
+from slam_observer_ros.tracking.covariances import MAX_POSE_ERRORS, of_moved_pose
 
 TOPICS = ('initialpose', '~/set_pose')
 

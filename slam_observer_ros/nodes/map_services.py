@@ -20,8 +20,8 @@ from std_srvs.srv import Trigger
 from slam_observer_ros.common.errors import MapError, ParameterError, SlamObserverError
 from slam_observer_ros.common.files import checked_name
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import check_writable, read_maps, write_map
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import check_writable, read_maps, write_map
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT_PERIODS = 20.0

@@ -18,7 +18,6 @@ from rclpy.timer import Timer
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.inputs.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.nodes.control_services import ControlServices
 from slam_observer_ros.nodes.guarded_node import Entities, GuardedNode, ThrottledLog
 from slam_observer_ros.nodes.initial_pose import InitialPoseListener, KeptPose
@@ -32,6 +31,7 @@ from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublis
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
 from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
 from slam_observer_ros.nodes.ros_interface import read_settings
+from slam_observer_ros.recordings.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.runs.mistakes import Search
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -184,7 +184,7 @@ def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic[Any]]) -> None:
         if name := outputs.get(source.topic):
             raise ParameterError(
                 f"the input '{source.name}' and the output '{name}' are both '{source.topic}': "
-                f'remap one of them, as with -r {name}:=observer/{name.removeprefix("~/")}'
+                f'remap one of them, as with -r {name}:=filter/{name.removeprefix("~/")}'
             )
 
 

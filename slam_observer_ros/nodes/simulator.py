@@ -11,7 +11,6 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.common.stamps import to_ns
-from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
@@ -23,6 +22,7 @@ from slam_observer_ros.nodes.ros_interface import (
     read_settings,
     RepeatableParameters,
 )
+from slam_observer_ros.recordings.trajectory import PoseTruth
 from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
 

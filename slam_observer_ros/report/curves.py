@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.consistency import (
+from slam_observer_ros.runs.consistency import (
     average_nees_band,
     CHI_SQUARE_95,
     normalised_squared_errors,

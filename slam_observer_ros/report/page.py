@@ -16,8 +16,8 @@ from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.messages.estimate_messages import half_sights
+from slam_observer_ros.recordings.trajectory import interpolate
 from slam_observer_ros.report.curves import (
     calibration,
     consistency,

@@ -22,21 +22,21 @@ from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import Smoothed, Update
 from slam_observer_ros.estimator.estimate import Estimate
-from slam_observer_ros.evaluation.consistency import anchored_average_nees
-from slam_observer_ros.evaluation.metrics import (
-    ConfigurationError,
-    landmark_errors,
-    trajectory_errors,
-    TrajectoryErrors,
-)
-from slam_observer_ros.evaluation.trajectory import filled, Trajectory
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.recorded_truth import Truth
-from slam_observer_ros.sensor_models.calibration import (
+from slam_observer_ros.lie import se3
+from slam_observer_ros.models.calibration import (
     DELAY,
     MOVES,
     OF_VELOCITY,
     stated_of_velocity,
+)
+from slam_observer_ros.recordings.recorded_truth import Truth
+from slam_observer_ros.recordings.trajectory import filled, Trajectory
+from slam_observer_ros.runs.consistency import anchored_average_nees
+from slam_observer_ros.runs.metrics import (
+    ConfigurationError,
+    landmark_errors,
+    trajectory_errors,
+    TrajectoryErrors,
 )
 
 logger = logging.getLogger(__name__)

@@ -24,8 +24,8 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.lie import so3
+from slam_observer_ros.models.observation_noise import ObservationNoise
 
 _IDENTITY = np.eye(3)
 

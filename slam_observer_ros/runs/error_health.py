@@ -16,9 +16,9 @@ from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.estimates import Innovations
-from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
+from slam_observer_ros.runs.metrics import TrajectoryErrors
 from slam_observer_ros.runs.reported_run import ReportedRun
 
 MAX_GROWTHS = 3

@@ -8,8 +8,6 @@ from slam_observer_ros.common.stamps import is_due, NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
-from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth
 from slam_observer_ros.messages.estimate_messages import (
     encode_transform,
     EstimateMessages,
@@ -18,8 +16,10 @@ from slam_observer_ros.messages.estimate_messages import (
     uncertain_pose,
 )
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.trajectory import LandmarkTruth
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.health import diagnostics
+from slam_observer_ros.runs.metrics import TrajectoryErrors
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 

@@ -26,7 +26,7 @@ from slam_observer_ros.estimates import (
     Reason,
     Update,
 )
-from slam_observer_ros.geometry.matrices import MAX_DEVIATION
+from slam_observer_ros.lie.matrices import MAX_DEVIATION
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 from slam_observer_ros.settings.estimator_settings import Settings
 

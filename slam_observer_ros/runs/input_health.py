@@ -8,10 +8,10 @@ from dataclasses import replace
 
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimates import Reason
-from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
-from slam_observer_ros.recording.contents import Arrivals
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.recordings.contents import Arrivals
+from slam_observer_ros.recordings.event_builder import NO_TRANSFORM
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.topics import SelectedTopics
 from slam_observer_ros.runs.health import of_stamps
 from slam_observer_ros.runs.reported_run import Replay
 from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES

@@ -24,9 +24,10 @@ from slam_observer_ros.events import (
     Event,
     ObservationEvent,
 )
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import so3
+from slam_observer_ros.lie.axes import axes_of
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.runs.accuracy import LikelihoodRecorder
 from slam_observer_ros.runs.corrections import (
     ALIKE,
@@ -42,7 +43,6 @@ from slam_observer_ros.runs.corrections import (
     SIZED,
     turned,
 )
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
 Maps: TypeAlias = LandmarkMap | Sequence[LandmarkMap]

@@ -16,15 +16,15 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Update, used_points
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import ConfigurationError
-from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityBlock
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.recorded_truth import LandmarkTracks, Truth
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.models.sensing import RangeErrors
+from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.recordings.recorded_truth import LandmarkTracks, Truth
+from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
+from slam_observer_ros.runs.metrics import ConfigurationError
 from slam_observer_ros.runs.reported_run import Replay, RunRecorder
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
-from slam_observer_ros.sensor_models.sensing import RangeErrors
-from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 
 P = ParamSpec('P')

@@ -23,11 +23,11 @@ from slam_observer_ros.estimates import (
     Update,
 )
 from slam_observer_ros.estimator.estimate import Estimate
-from slam_observer_ros.evaluation.metrics import ConfigurationError, pose_errors, TrajectoryErrors
-from slam_observer_ros.evaluation.trajectory import interpolate, LandmarkTruth, Trajectory
 from slam_observer_ros.events import UNKNOWN_ID
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.lie import se3
+from slam_observer_ros.recordings.recorded_truth import Truth
+from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory
+from slam_observer_ros.runs.metrics import ConfigurationError, pose_errors, TrajectoryErrors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 FIRST_PERIOD_NS = 250_000_000

@@ -6,9 +6,9 @@ import numpy as np
 
 from slam_observer_ros.common.stamps import due_rows, NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.recordings.trajectory import Trajectory
 
 SAMPLE_PERIOD_NS = 50_000_000
 """Least time between two poses of a sampled trajectory."""

@@ -10,8 +10,8 @@
  * the functions named read_...; nothing is checked after them. Nothing is kept from call to call.
  * Other threads run meanwhile: the equations are those of the caller alone.
  */
-#include "../observer/_door.h" /* first, as it includes Python.h */
-#include "../observer/_se3.h"
+#include "../filter/_door.h" /* first, as it includes Python.h */
+#include "../filter/_se3.h"
 
 enum { STRIDE = 8, INNER = STRIDE - 1 }; /* bordered_chain.py */
 enum { LONGEST = 1 << 24 };              /* no product of sizes overflows */

@@ -27,7 +27,7 @@ from scipy.sparse import csc_array
 
 from slam_observer_ros.common.compiled import compiled
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.matrices import inverse_by_factor, transpose
+from slam_observer_ros.lie.matrices import inverse_by_factor, transpose
 
 COMPILED = compiled('smoothing._gauss_newton')
 

@@ -21,10 +21,10 @@ from types import ModuleType
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import EstimatedAxes, PLANAR
-from slam_observer_ros.geometry.matrices import transpose
-from slam_observer_ros.observer.arrays import UNKNOWN_RAD
+from slam_observer_ros.filter.arrays import UNKNOWN_RAD
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import EstimatedAxes, PLANAR
+from slam_observer_ros.lie.matrices import transpose
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import (
     ChainFactors,

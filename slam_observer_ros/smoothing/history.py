@@ -10,14 +10,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import transpose
-from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
-from slam_observer_ros.observer.arrays import SeenOrientations
-from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.motion import Motion
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.filter.arrays import SeenOrientations
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.lie.matrices import transpose
+from slam_observer_ros.lie.sensor_mounting import joined_sensed, Sensed
+from slam_observer_ros.models.calibration import Calibration
+from slam_observer_ros.models.motion import Motion
+from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.smoothing.keyframes import (
     joined,
     joined_turns,

@@ -21,8 +21,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry.matrices import definite_inverse
-from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
+from slam_observer_ros.lie.matrices import definite_inverse
+from slam_observer_ros.lie.sensor_mounting import joined_sensed, Sensed
 
 EXACT_M = 1e-6
 """Standard deviation of a position that is said to be exact, metres."""

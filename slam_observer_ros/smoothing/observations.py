@@ -12,11 +12,11 @@ from typing import TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import transpose
-from slam_observer_ros.geometry.sensor_mounting import Sensed, sensitivity, shown_at, turning
-from slam_observer_ros.observer.arrays import flip_verdicts
+from slam_observer_ros.filter.arrays import flip_verdicts
+from slam_observer_ros.lie import so3
+from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.lie.matrices import transpose
+from slam_observer_ros.lie.sensor_mounting import Sensed, sensitivity, shown_at, turning
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import solve_definite, transpose
-from slam_observer_ros.observer.arrays import UNKNOWN_RAD
+from slam_observer_ros.filter.arrays import UNKNOWN_RAD
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.lie.matrices import solve_definite, transpose
 from slam_observer_ros.smoothing.keyframes import EXACT_M
 
 ANYWHERE_M = 1e3

@@ -27,13 +27,13 @@ import numpy as np
 from slam_observer_ros.common.errors import ParameterError, SmoothingError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.observer.joint_covariance import JointCovariance
-from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.motion import Motion
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.filter.joint_covariance import JointCovariance
+from slam_observer_ros.filter.observer import Observer
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.models.calibration import Calibration
+from slam_observer_ros.models.motion import Motion
+from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe

@@ -24,7 +24,7 @@ from slam_observer_ros.cli.batch_jobs import grid_points, opened_log, part_of, r
 from slam_observer_ros.cli.batch_pool import local_pool
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.accuracy import FIGURES
 
 PATIENCE_S = 60.0

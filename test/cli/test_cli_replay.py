@@ -13,9 +13,9 @@ import recordings
 import ros_messages as ros
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.trajectory import PoseTruth
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.simulation import Scenario, Simulation
 
 REPORT_KEYS = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.cli.simulate import LYAPUNOV_FLOOR
-from slam_observer_ros.evaluation.metrics import fit_decay
+from slam_observer_ros.runs.metrics import fit_decay
 
 PAPER_SLOPE = -2.0 * (1.0 / 4.0) / np.log(10.0)
 

@@ -16,8 +16,8 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from tum_files import read_tum
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.mapping.map_file import read_map
 from slam_observer_ros.simulation import Scenario, Simulation
 
 CAMERA = se3.from_rpy((0.2, 0.0, 0.4, -np.pi / 2, 0.0, -np.pi / 2))

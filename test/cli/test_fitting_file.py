@@ -16,9 +16,9 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.writer import RecordingWriter
 
 STEP_NS = 50_000_000
 SEEN = np.array([[2.0, 0.0, 0.0], [1.0, 1.0, 0.0]])

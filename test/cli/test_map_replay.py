@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose
 import pytest
 from tum_files import read_tum
 
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_map, write_map
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import read_map, write_map
+from slam_observer_ros.recordings.trajectory import LandmarkTruth, PoseTruth
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.settings.estimator_settings import Settings
 
 BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])

@@ -9,7 +9,7 @@ import pytest
 from recordings import write_events
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.known_map.map_file import write_map
+from slam_observer_ros.mapping.map_file import write_map
 from slam_observer_ros.runs.corrections import MISTAKES, SYMPTOMS
 
 OPTIONS = ('--config', 'wheeled_robot', '--set', 'bearing_noise=0.01')

@@ -17,7 +17,7 @@ from slam_observer_ros.cli.noise_search import (
     without_effect,
 )
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.accuracy import Likelihood
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import changed_names, table

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.recording.data_sets import load_plaza
+from slam_observer_ros.recordings.data_sets import load_plaza
 
 
 @pytest.fixture(scope='module')

@@ -8,12 +8,12 @@ import pytest
 import ros_messages as ros
 from tum_files import read_tum
 
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.topics import TopicNames
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.topics import TopicNames
+from slam_observer_ros.recordings.trajectory import LandmarkTruth, PoseTruth
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.settings.input_settings import InputSettings
 
 MS = 1_000_000

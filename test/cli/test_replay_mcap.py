@@ -12,8 +12,8 @@ import ros_messages as ros
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
 
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.lie import se3
+from slam_observer_ros.recordings.writer import RecordingWriter
 
 LAYOUT = Path(__file__).resolve().parents[2] / 'foxglove' / 'replay.json'
 

@@ -11,8 +11,8 @@ import recordings
 from tum_files import read_tum
 import yaml
 
-from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.runs.metrics import trajectory_errors
 
 
 class TestOutputs:

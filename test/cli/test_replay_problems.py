@@ -10,7 +10,7 @@ import recordings
 import ros_messages as ros
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.writer import RecordingWriter
 
 
 def without(kind):

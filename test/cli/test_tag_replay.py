@@ -10,8 +10,8 @@ from rosbags import rosbag2
 from rosbags.rosbag2 import StoragePlugin
 from tag_drives import past_tags, SEED, SETTINGS, true_tags
 
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.lie import so3
+from slam_observer_ros.mapping.map_file import read_map
 
 STEPS = 300
 

@@ -8,7 +8,7 @@ import pytest
 
 from slam_observer_ros.common import compiled
 
-NAMES = ('observer._core', 'smoothing._gauss_newton')
+NAMES = ('filter._core', 'smoothing._gauss_newton')
 
 
 @pytest.fixture(name='sources')
@@ -16,7 +16,7 @@ def fixture_sources(tmp_path, monkeypatch):
     """Return a folder that takes the package's place, with the sources of what is compiled."""
     if compiled.compiled(NAMES[0]) is None:
         pytest.skip('the core was not compiled, or is not to be used')
-    for folder in ('observer', 'smoothing'):
+    for folder in ('filter', 'smoothing'):
         (tmp_path / folder).mkdir()
         for path in (compiled.PACKAGE / folder).glob('_*.[ch]'):
             shutil.copy(path, tmp_path / folder)
@@ -27,7 +27,7 @@ def fixture_sources(tmp_path, monkeypatch):
 @pytest.mark.parametrize('name', NAMES)
 def test_a_core_built_from_other_sources_is_not_used_and_how_to_build_it_is_said(name, sources):
     assert compiled.compiled(name) is not None
-    with (sources / 'observer' / '_door.h').open('a') as header:
+    with (sources / 'filter' / '_door.h').open('a') as header:
         header.write('\n')
     with pytest.warns(RuntimeWarning, match=r'from other sources .* build it by `make`'):
         assert compiled.compiled(name) is None

@@ -20,7 +20,7 @@ from rich.console import Console
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
 
-from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.recordings.trajectory import Trajectory
 from slam_observer_ros.simulation import Scenario, Simulation
 
 pytestmark = pytest.mark.ros

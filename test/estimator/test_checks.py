@@ -16,9 +16,9 @@ from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator.checks import SECTORS
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityBlock, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import are_covariances
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import are_covariances
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 IDS, POINTS = np.arange(4), np.array([[1.0, 0, 0], [0, 2, 0], [3, 1, 1], [2, 2, 2]])

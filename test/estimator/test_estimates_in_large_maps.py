@@ -11,10 +11,10 @@ import pytest
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.geometry import so3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.riccati.active_landmarks import BlockSize
-from slam_observer_ros.observer.riccati.riccati import RiccatiGains
+from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
+from slam_observer_ros.filter.riccati.riccati import RiccatiGains
+from slam_observer_ros.lie import so3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SETTINGS = Settings(reorder_window=0.0, max_landmarks=0)

@@ -25,8 +25,8 @@ from slam_observer_ros.estimator import event_warnings
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.timeline import MAX_PENDING_VELOCITIES
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 

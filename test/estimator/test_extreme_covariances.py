@@ -8,9 +8,9 @@ import pytest
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.matrices import are_covariances, lifted, mended
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.matrices import are_covariances, lifted, mended
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PERIOD_NS = 100_000_000

@@ -24,20 +24,20 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.estimator.timeline import carried_forward, MAX_PENDING_VELOCITIES, Timeline
-from slam_observer_ros.evaluation.consistency import average_nees
-from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
-from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.runs.consistency import average_nees
+from slam_observer_ros.runs.metrics import pose_errors
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state import step as state_step
-from slam_observer_ros.state.matching import match
-from slam_observer_ros.state.state import State
+from slam_observer_ros.tracking import step as state_step
+from slam_observer_ros.tracking.hypotheses import Hypotheses
+from slam_observer_ros.tracking.matching import match
+from slam_observer_ros.tracking.state import State
 
 
 @hypothesis_settings(max_examples=20)

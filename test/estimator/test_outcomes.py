@@ -14,7 +14,7 @@ from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import Change, Reason, used_points
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import IMPOSSIBLE_ID, ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 
 LANDMARKS = 12

@@ -15,9 +15,9 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.sensor_models.velocity_history import STANDS_NS, TURNS, VelocityHistory
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.models.velocity_history import STANDS_NS, TURNS, VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PERIOD_NS = 50_000_000

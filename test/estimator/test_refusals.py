@@ -14,14 +14,14 @@ from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, LAST_AUTOMATIC_ID
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator.checks import MAX_MEASURED
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     IMPOSSIBLE_ID,
     ObservationEvent,
     VelocityEvent,
 )
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.recordings.trajectory import PoseTruth
 from slam_observer_ros.settings.estimator_settings import Settings
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 STEP_S, LAP_S = 0.2, 40.0

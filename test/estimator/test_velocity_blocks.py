@@ -19,7 +19,7 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 
 START_NS = 1_700_000_000_000_000_000

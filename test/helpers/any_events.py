@@ -19,12 +19,12 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import are_covariances, diagonal_blocks
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import are_covariances, diagonal_blocks
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import Parameter, table, Value
-from slam_observer_ros.state.step import flipped
+from slam_observer_ros.tracking.step import flipped
 
 ROWS = table(Settings)
 

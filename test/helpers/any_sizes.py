@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 
 STEP_NS = 100_000_000

@@ -9,10 +9,10 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.motion_noise import MotionNoise
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.lie import se3
+from slam_observer_ros.models.held_velocities import HeldVelocities
+from slam_observer_ros.models.motion_noise import MotionNoise
+from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
 START_NS = 1_000_000_000

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 POINT_NOISE_M = 0.05

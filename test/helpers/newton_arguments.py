@@ -10,8 +10,8 @@ import numpy as np
 from smoothing_problems import LANDMARKS, Problem
 from step_arguments import refusals
 
-from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.geometry.sensor_mounting import Sensed
+from slam_observer_ros.lie.axes import PLANAR, SPATIAL
+from slam_observer_ros.lie.sensor_mounting import Sensed
 from slam_observer_ros.smoothing import bordered_chain
 from slam_observer_ros.smoothing.bordered_chain import Equations
 from slam_observer_ros.smoothing.gauss_newton import Smoother

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.gains import Gains
-from slam_observer_ros.observer.observer import Residuals
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.filter.gains import Gains
+from slam_observer_ros.filter.observer import Residuals
+from slam_observer_ros.lie import se3
+from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PLAIN = Settings(

@@ -14,10 +14,10 @@ from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import get_typestore, Stores
 
-from slam_observer_ros.evaluation.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.lie import se3
+from slam_observer_ros.recordings.trajectory import LandmarkTruth, PoseTruth
+from slam_observer_ros.recordings.writer import RecordingWriter
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 """The recording that comes with the package."""

@@ -17,7 +17,7 @@ import tempfile
 from slam_observer_ros.common.compiled import digest_of_sources, PACKAGE
 
 CHECKOUT = Path(__file__).resolve().parents[2]
-MODULES = ('observer._core', 'smoothing._gauss_newton')
+MODULES = ('filter._core', 'smoothing._gauss_newton')
 
 PREAMBLE = """
 import importlib.util, sys

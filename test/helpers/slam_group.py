@@ -3,7 +3,7 @@
 The paper writes A p̄ for points and A v⃗ for directions; here these are `se3.transform` and
 `se3.rotate`. All functions take n = 0, 1 or many landmarks and any leading axes; metres, rad, s.
 The package only uses `exp`, at each correction by Riccati gains that map. The rest is what the
-paper states; tests hold :class:`slam_observer_ros.observer.observer.Observer` against it.
+paper states; tests hold :class:`slam_observer_ros.filter.observer.Observer` against it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.observer.chart import slam_exp, SlamElement
+from slam_observer_ros.filter.chart import slam_exp, SlamElement
+from slam_observer_ros.lie import se3, so3
 
 exp = slam_exp
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import (
     Keyframes,

@@ -5,8 +5,7 @@ from __future__ import annotations
 from any_sizes import up_to
 import numpy as np
 
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.flat_arrays import (
+from slam_observer_ros.filter.flat_arrays import (
     Advanced,
     FilterState,
     Interval,
@@ -15,9 +14,10 @@ from slam_observer_ros.observer.flat_arrays import (
     Observed,
     Seen,
 )
-from slam_observer_ros.sensor_models.motion_noise import Factors, MotionFigures
-from slam_observer_ros.sensor_models.observation_noise import PointFigures
-from slam_observer_ros.sensor_models.velocity_history import NEVER_NS, Velocities
+from slam_observer_ros.lie import se3
+from slam_observer_ros.models.motion_noise import Factors, MotionFigures
+from slam_observer_ros.models.observation_noise import PointFigures
+from slam_observer_ros.models.velocity_history import NEVER_NS, Velocities
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_700_000_000 * SECOND_NS

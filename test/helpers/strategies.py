@@ -12,7 +12,7 @@ import numpy as np
 from slam_group import SlamElement, SlamVelocity, TotalState
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
 
 LANDMARK_COUNTS = (0, 1, 25)
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.trajectory import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.recordings.trajectory import PoseTruth
 
 SEED = 0
 STEP_NS = 50_000_000

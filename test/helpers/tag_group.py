@@ -14,8 +14,8 @@ import slam_group
 from slam_group import TotalState
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.observer.chart import SlamElement
+from slam_observer_ros.filter.chart import SlamElement
+from slam_observer_ros.lie import se3, so3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.recordings.trajectory import Trajectory
 
 
 def read_tum(path: Path) -> Trajectory:

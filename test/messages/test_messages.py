@@ -15,7 +15,7 @@ import ros_messages as ros
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import BEARING, IMPOSSIBLE_ID, MAX_ID, POINT, RANGE
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.messages import clouds, poses
 from slam_observer_ros.messages.estimate_messages import (
     encode_transform,

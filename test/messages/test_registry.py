@@ -18,8 +18,8 @@ from slam_observer_ros.events import ObservationEvent, VelocityBlock, VelocityEv
 from slam_observer_ros.messages.cdr import CdrReader, encode_string
 from slam_observer_ros.messages.poses import decode_twist_stamped
 from slam_observer_ros.messages.registry import decoders, reads
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.settings import input_settings
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.ros
 FAILING_NODE = """\
 import sys
 import numpy as np
-from slam_observer_ros.association.hypotheses import Hypotheses
+from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.observer_core import ObserverCore
 from slam_observer_ros.nodes.executables import observer_node

@@ -15,8 +15,8 @@ from robots import Robot
 from slam_observer_ros import Estimator, Settings
 from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.nodes import initial_pose
 from slam_observer_ros.nodes.initial_pose import (
     KeptPose,

@@ -18,7 +18,7 @@ from tag_drives import past_tags, SETTINGS, STEP_NS
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.estimate_messages import (
     EstimateMessages,
@@ -26,9 +26,9 @@ from slam_observer_ros.messages.estimate_messages import (
     uncertain_pose,
 )
 from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.topics import TopicNames
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.topics import TopicNames
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings

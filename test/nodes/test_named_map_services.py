@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros import Estimator, LandmarkMap, Settings
-from slam_observer_ros.known_map.map_file import read_map, write_map
+from slam_observer_ros.mapping.map_file import read_map, write_map
 from slam_observer_ros.nodes.map_services import MapServices, NamedMapServices, path_of
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

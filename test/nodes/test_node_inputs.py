@@ -32,7 +32,7 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import decode_twist, ODOMETRY
 from slam_observer_ros.nodes.intake import chosen_inputs

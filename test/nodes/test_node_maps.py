@@ -24,16 +24,16 @@ from std_srvs.srv import Trigger
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import diagonal_blocks
-from slam_observer_ros.inputs.frames import TransformBuffer
-from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import diagonal_blocks
+from slam_observer_ros.mapping.map_file import read_map
 from slam_observer_ros.messages.estimate_messages import StateMessages, uncertain_pose
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.observer_nodes import ObserverNode
 from slam_observer_ros.nodes.ros_interface import MESSAGES
+from slam_observer_ros.recordings.frames import TransformBuffer
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

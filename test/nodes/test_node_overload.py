@@ -13,7 +13,7 @@ import pytest
 from robots import own_topics, Robot, stamp_ns, TransformSender
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.nodes.intake.lateness import LoadShedding, Waiting
 from slam_observer_ros.nodes.ros_interface import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import PointCloud2
 
-from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.mapping.map_file import read_map
 from slam_observer_ros.nodes.ros_interface import MESSAGES
 
 pytestmark = pytest.mark.ros
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.ros
 SLOW_NODE = """\
 import sys
 import time
-from slam_observer_ros.association.hypotheses import Hypotheses
+from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.nodes.executables import observer_node
 
 observe, seen = Hypotheses.observe, []

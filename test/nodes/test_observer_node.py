@@ -388,7 +388,7 @@ def test_a_node_does_not_take_in_its_own_estimate(ros, source, output, topic, re
     arguments = [argument for remap in remaps for argument in ('-r', remap)]
     reason = reason_of_refusal(ObserverNode, *arguments)
     assert f"input '{source}' and the output '{output}' are both '{topic}'" in reason
-    assert f'-r {output}:=observer/{output.removeprefix("~/")}' in reason
+    assert f'-r {output}:=filter/{output.removeprefix("~/")}' in reason
 
 
 def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path):

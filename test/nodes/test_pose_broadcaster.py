@@ -11,14 +11,14 @@ import pytest
 from rclpy.serialization import deserialize_message
 from robots import pose_of, stamp_ns
 
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import TransformBuffer
+from slam_observer_ros.lie import se3
 from slam_observer_ros.nodes.publishing.pose_broadcaster import (
     DISCOVERY_S,
     MAX_WAITING_NS,
     PoseBroadcaster,
     TFMessage,
 )
+from slam_observer_ros.recordings.frames import TransformBuffer
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not installed')

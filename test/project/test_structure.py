@@ -99,7 +99,7 @@ def test_what_is_estimated_is_changed_in_place():
 def test_one_module_knows_the_coordinates_of_the_errors():
     """But for the usual step, which spells them out beside the equations."""
     knows = re.compile(r'axes\.(turn|output)_matrix')
-    known = list((PACKAGE / 'observer' / 'riccati').rglob('*.py'))
+    known = list((PACKAGE / 'filter' / 'riccati').rglob('*.py'))
     assert len(known) > 5
     for path in known:
         assert not knows.search(path.read_text(encoding='utf-8')), path

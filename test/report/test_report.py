@@ -16,9 +16,9 @@ from recordings import events, MESSAGE_COUNT, SAMPLE, write_events, write_mcap
 
 from slam_observer_ros import __version__
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.evaluation.consistency import ellipses
 from slam_observer_ros.events import BEARING, ObservationEvent, RANGE
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.writer import RecordingWriter
+from slam_observer_ros.runs.consistency import ellipses
 from slam_observer_ros.runs.error_health import growth_windows
 
 MEGABYTE = 1_000_000

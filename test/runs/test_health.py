@@ -14,7 +14,7 @@ from recordings import events
 import slam_observer_ros
 from slam_observer_ros.common.findings import found, KINDS, Level
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.health import of_fit, of_left_out, of_rejections
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -116,7 +116,7 @@ def test_log_json_report_and_recorded_diagnostics_say_the_same(wild, tmp_path, s
 
 @pytest.mark.parametrize(
     'folder',
-    ['recording', 'inputs', 'messages', 'estimator', 'association', 'known_map', 'smoothing'],
+    ['recordings', 'messages', 'estimator', 'tracking', 'mapping', 'smoothing'],
 )
 def test_what_is_logged_below_the_command_line_is_a_finding(folder):
     for path in (Path(slam_observer_ros.__file__).parent / folder).glob('*.py'):

@@ -10,7 +10,7 @@ import pytest
 
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.events import ObservationEvent, RANGE, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.lie import so3
 from slam_observer_ros.runs.corrections import explained, first_drive
 from slam_observer_ros.runs.mistakes import mistakes
 

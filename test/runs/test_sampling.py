@@ -12,8 +12,8 @@ import pytest
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.lie import se3
+from slam_observer_ros.recordings.recorded_truth import Truth
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.runs.sampling import SAMPLE_PERIOD_NS
 from slam_observer_ros.settings.estimator_settings import Settings

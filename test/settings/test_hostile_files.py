@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 import pytest
 
 from slam_observer_ros.common.errors import MapError, ParameterError, SlamObserverError
-from slam_observer_ros.known_map.map_file import MAX_BYTES as MAX_MAP_BYTES
-from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.mapping.map_file import MAX_BYTES as MAX_MAP_BYTES
+from slam_observer_ros.mapping.map_file import read_map
 from slam_observer_ros.settings.parameter_file import MAX_BYTES, read_parameter_file
 
 MAP = """\

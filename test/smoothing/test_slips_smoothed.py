@@ -9,12 +9,12 @@ from gain_worlds import START_NS
 import numpy as np
 import pytest
 
-from slam_observer_ros.association.slip import slip
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.matching import match
+from slam_observer_ros.tracking.matching import match
+from slam_observer_ros.tracking.slip import slip
 
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0, smoothing_window=0)
 SPATIAL = replace(PLANAR, two_d_mode=False)

@@ -23,17 +23,17 @@ from strategies import generators
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import trajectory_errors
-from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.observer.arrays import FilterArrays
-from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.riccati.riccati import RiccatiGains
-from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.motion import Motion
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.filter.arrays import FilterArrays
+from slam_observer_ros.filter.known_landmarks import KnownLandmarks
+from slam_observer_ros.filter.riccati.riccati import RiccatiGains
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import PLANAR, SPATIAL
+from slam_observer_ros.models.calibration import Calibration
+from slam_observer_ros.models.motion import Motion
+from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.recordings.trajectory import Trajectory
+from slam_observer_ros.runs.metrics import trajectory_errors
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
 from slam_observer_ros.smoothing.history import History, Keyframe

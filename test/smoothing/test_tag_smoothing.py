@@ -14,13 +14,13 @@ from strategies import generators
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
 from slam_observer_ros.smoothing.keyframes import no_keyframes, SeenTurns, Solution
 from slam_observer_ros.smoothing.observations import Observations
-from slam_observer_ros.state.step import flipped
+from slam_observer_ros.tracking.step import flipped
 
 SIGMA_RAD, SIGMA_M = 0.05, 0.05
 TURN_NOISE, SPEED_NOISE = 0.1, 0.1  # rad/√s, m/√s

@@ -18,7 +18,6 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.inputs.odometry import OdometryCheck
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.clouds import CLOUDS, ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
@@ -34,6 +33,7 @@ from slam_observer_ros.messages.registry import Decode, decoders
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.ros_interface import is_installed, message_class
+from slam_observer_ros.recordings.odometry import OdometryCheck
 from slam_observer_ros.settings.input_settings import (
     AUTO,
     message_types,

@@ -20,17 +20,17 @@ from slam_observer_ros.events import (
     ObservationEvent,
     VelocityEvent,
 )
-from slam_observer_ros.inputs.event_builder import (
+from slam_observer_ros.messages.clouds import scan_problem
+from slam_observer_ros.nodes.guarded_node import described, ThrottledLog
+from slam_observer_ros.nodes.intake.lateness import ClockChange, ClockOffset
+from slam_observer_ros.recordings.event_builder import (
     drop_reason,
     DropError,
     EventBuilder,
     Measured,
     with_receive_time,
 )
-from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.messages.clouds import scan_problem
-from slam_observer_ros.nodes.guarded_node import described, ThrottledLog
-from slam_observer_ros.nodes.intake.lateness import ClockChange, ClockOffset
+from slam_observer_ros.recordings.frames import BaseFrame
 from slam_observer_ros.settings.input_settings import ON_TF
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

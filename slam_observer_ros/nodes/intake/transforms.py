@@ -11,13 +11,13 @@ from rclpy.subscription import Subscription
 from slam_observer_ros.common.errors import MessageError, TransformError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import ALWAYS_NS, insert_transforms, TransformBuffer
+from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.detections import CAMERA_INFO, decode_camera_info
 from slam_observer_ros.messages.poses import decode_transforms
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.intake.input_topic import take
 from slam_observer_ros.nodes.ros_interface import message_class, TFMessage
+from slam_observer_ros.recordings.frames import ALWAYS_NS, insert_transforms, TransformBuffer
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 TF_QOS = QoSProfile(depth=100)

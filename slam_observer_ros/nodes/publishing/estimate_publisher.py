@@ -16,7 +16,6 @@ from visualization_msgs.msg import MarkerArray
 from slam_observer_ros.common.stamps import is_due, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimate import Estimate
-from slam_observer_ros.inputs.frames import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.clouds import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import (
     EstimateMessages,
@@ -34,6 +33,7 @@ from slam_observer_ros.nodes.ros_interface import (
     MESSAGES,
     RELIABLE_QOS,
 )
+from slam_observer_ros.recordings.frames import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 SLACK = 0.5

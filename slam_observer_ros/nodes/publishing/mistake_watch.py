@@ -13,7 +13,7 @@ from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.events import Event
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.runs.corrections import driven_s, SUSPICIOUS
 from slam_observer_ros.settings.estimator_settings import Settings
 

@@ -11,11 +11,11 @@ from rclpy.qos import QoSProfile
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.frames import TransformBuffer
+from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.estimate_messages import encode_transform
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.ros_interface import RELIABLE_QOS, TFMessage
+from slam_observer_ros.recordings.frames import TransformBuffer
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 SENT = 10  # messages that may be on their way back at once

@@ -1,0 +1,270 @@
+"""How X̂ on SLAM_n(3) is advanced, corrected and extended, and the covariance of its errors.
+
+Gains that know no joint covariance have no errors, and what a subclass of :class:`Gains` does not
+override is right where no noise is known. Landmarks are given by rows (m,), points (m, 3) in the
+body frame, metres, with covariances (m, 3, 3), m², and how the points change with the calibration,
+D (m, 3, c), reference frame; None where they don't.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from copy import copy
+import math
+from typing import ClassVar, Protocol, TYPE_CHECKING
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.filter.arrays import SeenOrientations
+from slam_observer_ros.filter.joint_covariance import JointCovariance
+from slam_observer_ros.filter.known_landmarks import KnownLandmarks
+from slam_observer_ros.filter.observer import Observer, Residuals
+from slam_observer_ros.lie.axes import axes_of, EstimatedAxes
+from slam_observer_ros.lie.matrices import mahalanobis, with_blocks
+from slam_observer_ros.models.calibration import (
+    Calibration,
+    without_calibration,
+)
+from slam_observer_ros.models.motion import Motion, Passage
+from slam_observer_ros.models.motion_noise import MotionNoise
+from slam_observer_ros.settings.estimator_settings import Settings
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
+"""Settings without effect on other gains; ``gain_k`` is in the Lyapunov value of all."""
+
+
+class Errors:
+    """Errors of an ``observer``'s X̂, as the covariance P, ``joint``, has them.
+
+    They are in the reference frame; covariances are in m² and rad².
+    """
+
+    def __init__(self, observer: Observer, joint: JointCovariance, axes: EstimatedAxes) -> None:
+        self.observer, self.joint, self.axes = observer, joint, axes
+
+    def copy(self, observer: Observer) -> Errors:
+        """Return an independent copy for a copy of the observer."""
+        return Errors(observer, self.joint.copy(observer), self.axes)
+
+    def pose_covariance(self, motion: Motion | Passage | None = None) -> FloatArray:
+        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come.
+
+        (s, 6, 6) at the s instants of a passage. Zero on axes that are not estimated.
+        """
+        if motion is None:
+            return self.axes.full_pose_covariance(self.joint.pose)
+        return self.axes.full_pose_covariance(motion.pose_covariance(self.joint.of_robot))
+
+    def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
+        """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
+        points = self.observer.points + duration_s * self.observer.u
+        return self.joint.landmarks(points, duration_s)
+
+    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
+        return self.joint.with_pose(rows, self.observer.points[rows])
+
+    def orientation_matrices(self, rows: IntArray) -> FloatArray:
+        """Return orientations B̂_i (m, 3, 3) of landmarks, zero where there is none."""
+        return self.joint.turned(rows, self.observer.orientations.B[rows])
+
+    def orientation_sigmas(self, rows: IntArray) -> FloatArray:
+        """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
+        if self.observer.is_exact:
+            sigmas: FloatArray = self.observer.orientations.map_sigmas[rows]
+            return sigmas
+        largest = np.linalg.eigvalsh(self.joint.own_turns(rows))[:, -1]
+        return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
+
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        r, R = residuals.on(self.axes)
+        C = self.joint.output_matrix(residuals, chord=0.5)
+        _, predicted = self.joint.output(C, residuals.rows)
+        return mahalanobis(r, predicted + R)
+
+    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
+        """Return the joint covariance (m k, m k) of residuals, noise included."""
+        return with_blocks(self.predicted(residuals)[1], residuals.on(self.axes)[1])
+
+    def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+        """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
+        C = self.joint.output_matrix(residuals, chord=0.5)
+        return self.joint.outputs(C, residuals.rows)
+
+
+class TagGains(Protocol):
+    """What moves X̂ by how tags are turned."""
+
+    def learn_motion_noise(self, residuals: Residuals) -> None:
+        """Let residuals show how noisy the motion was, before orientations correct it."""
+
+    def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
+        """Move the state by known orientations; return weights (m,), and which are unclear."""
+
+    def add_orientations(self, seen: SeenOrientations) -> None:
+        """Take over orientations as they are seen, where none is known yet."""
+
+
+class Gains(ABC):
+    """What moves an ``observer``'s X̂, which starts at ``reference_pose`` P° (4, 4)."""
+
+    ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect
+    errors: Errors | None = None  # of pose and landmarks together, if their covariance is known
+
+    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
+        self._settings = settings
+        self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
+        self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
+        self.calibration = Calibration(self.observer, self.estimated(settings), self.axes)
+        self.motion_noise = MotionNoise(settings)
+
+    @staticmethod
+    def estimated(settings: Settings) -> Settings:
+        """Return the settings without what these gains do not estimate of a calibration."""
+        return without_calibration(settings)
+
+    def copy(self) -> Self:
+        """Return an independent copy."""
+        other = copy(self)
+        other.observer = self.observer.copy()
+        other.calibration = self.calibration.of(other.observer)
+        other.motion_noise = self.motion_noise.copy()
+        return other
+
+    @property
+    def tags(self) -> TagGains | None:
+        """What moves it by orientations of tags; None where only their positions are used."""
+        return None
+
+    # The step (27)-(31)
+
+    def advance(self, motion: Motion) -> None:
+        """Move pose and landmarks along a motion (27), and account for its noise."""
+        self.observer.propagate(motion.path)
+        self.observer.move_landmarks(motion.duration_s)
+
+    def activate(self, rows: IntArray) -> None:  # noqa: B027 (most gains treat all alike)
+        """See to it that landmarks (m,) are at hand that are going to be observed."""
+
+    def residuals(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        dt_s: FloatArray,
+        repeated: FloatArray,
+        D: FloatArray | None = None,
+    ) -> Residuals:
+        """Return what landmarks ``rows`` (m,) say against X̂ (29).
+
+        ``dt_s`` (m,) is the time since each was last seen, and ``repeated`` (m,) the factor by
+        which the covariances grow, as errors last.
+        """
+        observer = self.observer
+        e, r = observer.errors(rows, points)
+        turned = observer.turned(covariances)
+        return Residuals(rows, e, r, observer.a[rows], turned, dt_s, repeated, D)
+
+    @abstractmethod
+    def observe(self, residuals: Residuals) -> FloatArray:
+        """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
+
+    # Landmarks and sensors
+
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
+        """Append landmarks seen for the first time."""
+        self.observer.add_landmarks(points)
+
+    def add_known(self, known: KnownLandmarks) -> None:
+        """Append landmarks that a map knows, reference frame; their errors may be correlated."""
+        self.observer.add_reference_landmarks(known.points)
+
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
+        """Take landmarks for new ones, seen for the first time."""
+        self.observer.relocate_landmarks(rows, points)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``; those behind move up."""
+        self.observer.remove_landmarks(rows)
+
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit, and forget the copies.
+
+        Return the normalised square of how far they are apart, per axis; they fit up to ``most``.
+        """
+        return math.inf  # for all that is known
+
+    def fix_landmarks(self, known: KnownLandmarks) -> None:
+        """Take all landmarks for exact and at rest where a map has them; never move them."""
+        self.observer.fix_landmarks(known.points)
+
+    def add_sensor(self, frame: str) -> None:
+        """Let the calibration of the sensor of another frame be part of the state."""
+        self.calibration.add_sensor(frame)
+
+    # The frame
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
+        """Put the robot at Â = ``pose`` (4, 4), ε of ``covariance`` (6, 6) independent of all."""
+        self.observer.set_pose(pose)
+
+    @abstractmethod
+    def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
+        """Move the whole estimate to where m of its landmarks are known to be.
+
+        ``r`` (m, 3) is estimated minus known, reference frame; covariances are of the known ones.
+        """
+
+    def enter_map(self, rows: IntArray, known: KnownLandmarks) -> None:
+        """Move the estimate to where a map has landmarks ``rows`` (m,), and append its others.
+
+        ``known`` (m + …) are these m in the reference frame, then the others. Where no joint
+        covariance is known the map's errors are taken to be independent.
+        """
+        m = len(rows)
+        of_rows, others = (known.select(part) for part in np.split(np.arange(len(known)), [m]))
+        r = self.observer.points[rows] - of_rows.points
+        self.anchor(rows, r, of_rows.covariances)
+        self.observer.set_reference(self.observer.points)
+        self.add_known(others)
+
+    # The errors, by any gains
+
+    @property
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of the calibration's estimates."""
+        return np.empty(0)
+
+    @property
+    def takes_all(self) -> bool:
+        """Whether an observation changes the covariances of all landmarks, however many."""
+        return False
+
+    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks, if it is known."""
+        return None
+
+    def landmark_covariance(self, rows: IntArray, tags: IntArray) -> FloatArray | None:
+        """Return that (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,), if known."""
+        return None
+
+    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
+        """Return the joint covariance (m k, m k) of residuals; (0, 0) where none is known."""
+        return np.empty((0, 0))
+
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
+        return np.zeros(len(residuals.r))

@@ -1,0 +1,298 @@
+"""The Riccati filter: gains K = P Hᵀ (H P Hᵀ + R)⁻¹ from the covariance P of all errors.
+
+The error E = X̂ X⁻¹ (proof of Theorem 5.1) does not move while the robot does. In the coordinates
+of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i for any map,
+
+    H_i = [ 0  I  0 … −I … 0 ],
+
+with R̂ D_i besides at the calibration of the sensor that saw it (:mod:`.calibration`). The
+choice of the world's frame, which no observation can determine, is exactly in its null space: the
+covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
+X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
+in large maps less: :class:`.CompressedCovariance`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.filter.arrays import UNKNOWN_RAD
+from slam_observer_ros.filter.chart import Chart
+from slam_observer_ros.filter.gains import Errors, OF_CONSTANT_GAINS
+from slam_observer_ros.filter.joint_covariance import JointCovariance
+from slam_observer_ros.filter.known_landmarks import anchor, KnownLandmarks
+from slam_observer_ros.filter.observer import Residuals
+from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
+from slam_observer_ros.filter.riccati.covariances import CompressedCovariance, ExactMapCovariance
+from slam_observer_ros.filter.riccati.orientation_gains import OrientationGains
+from slam_observer_ros.filter.robust import AT_ONCE, observation_weights
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import block_diagonal, solve_symmetric, with_blocks
+from slam_observer_ros.models.motion import Motion
+from slam_observer_ros.settings.estimator_settings import Settings
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+MERGER_ROUNDS = 4
+"""How often a merger is linearised; the last times it hardly changes."""
+
+SAME_M = 0.01
+"""Standard deviation of how far apart two landmarks may be that are one, metres: no two views of
+a thing have quite the same centre.
+"""
+
+
+class RiccatiGains(OrientationGains):
+    """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
+
+    ignores = OF_CONSTANT_GAINS
+    block = BlockSize()  # of large maps
+
+    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
+        super().__init__(settings, reference_pose)
+        # Beside its position a landmark's velocity is estimated, or the orientation of a tag at
+        # rest; both are unknown at first.
+        speed = settings.landmark_velocity_stddev
+        velocity = self.axes.point if speed else 0
+        has_turns = settings.use_tag_orientation and not speed
+        axes = self.axes if has_turns else self.axes.of_points()
+        unknown = [UNKNOWN_RAD] * axes.turn + [speed] * velocity
+        joint = JointCovariance(
+            Chart(axes, self.calibration.count, velocity),
+            self.observer.covariance,
+            self.calibration.initial_covariance(),
+            np.array(unknown) ** 2,
+        )
+        self.errors = Errors(self.observer, joint, self.axes)
+
+    @staticmethod
+    def estimated(settings: Settings) -> Settings:
+        """Return the settings: all of a calibration is estimated."""
+        return settings
+
+    def copy(self) -> Self:
+        """Return an independent copy."""
+        other = super().copy()
+        other.errors = self.errors.copy(other.observer)
+        return other
+
+    def advance(self, motion: Motion) -> None:
+        """Move pose and landmarks along a motion (27), and add its noise to P."""
+        super().advance(motion)
+        self.joint.note_motion()
+        observer, active = self.observer, self.joint.active
+        points = observer.y_ref[active] + observer.a[active]
+        self.joint.propagate(motion, points, observer.u[active])
+        self.motion_noise.factors.move(motion.noise_by_kind)
+
+    def activate(self, rows: IntArray) -> None:
+        """See to it that landmarks (m,) are in P."""
+        self.joint.activate(rows)
+
+    def residuals(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        dt_s: FloatArray,
+        repeated: FloatArray,
+        D: FloatArray | None = None,
+    ) -> Residuals:
+        """Return what landmarks (m,), which are going to correct the state, say against it."""
+        self.joint.activate(rows)
+        return super().residuals(rows, points, covariances, dt_s, repeated, D)
+
+    def observe(self, residuals: Residuals) -> FloatArray:
+        """Move the state by exp(−K r); return the weight that each point was given."""
+        m = len(residuals.rows)
+        if m <= AT_ONCE:
+            x, weights = self._correction(residuals)
+            self._move(x)
+            return weights
+        # One block after the other costs less than all at once, and leaves the same. The state
+        # moves only then: all are linearised at the same point.
+        x, weights = np.zeros(len(self.joint.P)), np.empty(m)
+        for start in range(0, m, AT_ONCE):
+            block = residuals.select(slice(start, start + AT_ONCE))
+            change = self.joint.change_of_residuals(block, x)
+            change_of_x, weights[start : start + AT_ONCE] = self._correction(block.changed(change))
+            x += change_of_x
+        self._move(x)
+        return weights
+
+    def _correction(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+        """Update P; return −K r, and the weight (m,) of each point."""
+        r, R = residuals.on(self.axes)
+        # A gate, then Huber's weights; errors that last make R larger, too.
+        predicted = self.errors.predicted(residuals)[1]
+        self._learn_motion_noise(residuals, r, with_blocks(predicted, R))
+        weights = observation_weights(r, predicted, R, self._settings)
+        passed, used = weights > 0.0, residuals
+        if np.count_nonzero(passed) < len(r):
+            used, r, R = residuals.select(passed), r[passed], R[passed]
+        R = R * (used.repeated / weights[passed])[:, None, None]
+        # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
+        return self.joint.correct(self.joint.output_matrix(used), used.rows, R, r), weights
+
+    def add_sensor(self, frame: str) -> None:
+        """Let the calibration of the sensor of another frame be part of the state, and of P."""
+        variances = self.calibration.add_sensor(frame)
+        if len(variances):
+            self.joint = self.joint.dense()
+            self.joint.add_calibration(variances)
+            self._compress_if_large(0)
+
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
+        """Append landmarks seen for the first time."""
+        self._compress_if_large(len(points))
+        super().add(points, covariances)
+        self.motion_noise.factors.forget_motion()  # until now, which is none of theirs
+        self.joint.add_seen(self.observer.turned(covariances), D)
+
+    def add_known(self, known: KnownLandmarks) -> None:
+        """Append landmarks whose errors are independent of all else, or only of all others."""
+        if known.joint is None:
+            self._compress_if_large(len(known))
+            self.joint.add_known(known.points, known.covariances)
+        else:
+            self.joint = self.joint.dense()
+            self.joint.add_correlated(known)
+        super().add_known(known)
+        n = len(self.observer)
+        self.take_orientations(np.arange(n - len(known), n), known)
+        self._compress_if_large(0)
+
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
+        """Take landmarks for new ones; what was known of them is forgotten."""
+        self.joint.activate(rows)
+        super().relocate(rows, points, covariances)
+        self.joint.relocate(rows, self.observer.turned(covariances), D)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        self.joint.remove(rows)
+        super().remove(rows)
+
+    def fix_landmarks(self, known: KnownLandmarks) -> None:
+        """Take all landmarks for exact; P has pose and calibration from now on."""
+        super().fix_landmarks(known)
+        self.joint = ExactMapCovariance(self.joint, known.covariances)
+        self.observer.postponed = None
+        self.take_orientations(np.arange(len(known)), known)
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
+        """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
+        super().set_pose(pose, covariance)
+        self.motion_noise.factors.forget_motion()
+        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.observer.points)
+
+    def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
+        """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
+        # A motion exp(γ) of everything changes x by G γ, and the positions of the known landmarks
+        # by J γ.
+        self.joint = joint = self.joint.dense()
+        k = self.axes.point
+        G = joint.chart.gauge(len(self.observer))
+        J = joint.chart.moved(self.observer.points[rows]).reshape(-1, self.axes.p)
+        # What P says of these positions, and the map's noise.
+        HP, HPH = joint.project(joint.chart.still(self.observer.points[rows]), rows)  # of −ã_i
+        R = block_diagonal(covariances[:, :k, :k])
+        x, joint.P = anchor(joint.P, G, -HP.T, HPH + R, J, r[:, :k].ravel())
+        self._move(-x)
+
+    def enter_map(self, rows: IntArray, known: KnownLandmarks) -> None:
+        """Move the estimate to where a map has landmarks ``rows`` (m,), and append its others.
+
+        As far as the map's errors are correlated, seeing the m says where the others are, too.
+        """
+        if known.joint is None:
+            super().enter_map(rows, known)
+            self.take_orientations(rows, known.select(np.arange(len(rows))))
+            return
+        # The map beside the estimate, whose gauge γ does not move it, …
+        n, m = len(self.observer), len(rows)
+        own = self.observer.points[rows]
+        self.add_known(known)
+        self.joint = joint = self.joint.dense()
+        added = n + np.arange(len(known))
+        copies = added[:m]
+        chart, size = joint.chart, len(self.observer)
+        G = chart.gauge(size)
+        G[chart.of_landmarks(added)] = 0.0
+        G += chart.at_rest(size, added, known.points)
+        # … and landmarks that both have are the same.
+        H = chart.difference(size, rows, copies, own, known.points[:m])
+        PH, r = joint.P @ H.T, (own - known.points[:m])[:, : self.axes.point].ravel()
+        x, joint.P = anchor(joint.P, G, PH, H @ PH, H @ G, r)
+        self._move(-x)
+        self._merge_orientations(rows, copies)
+        self.remove(copies)
+        self.observer.set_reference(self.observer.points)
+        self._compress_if_large(0)
+
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit, and forget the copies.
+
+        Return the normalised square of how far they are apart, per axis; they fit up to ``most``.
+        """
+        self.joint = joint = self.joint.dense()
+        both, m = np.append(rows, copies), len(rows)
+        x, square = np.zeros(len(joint.P)), np.inf
+        # At the end of a loop the map may turn so far that it has to be linearised again.
+        for _ in range(MERGER_ROUNDS):
+            own, other = np.split(self._moved_points(both, -x), [m])
+            H = joint.chart.difference(len(self.observer), rows, copies, own, other)
+            HP, r = H @ joint.P, (own - other)[:, : self.axes.point].ravel() + H @ x
+            S = HP @ H.T + SAME_M**2 * np.eye(len(r))
+            weighted = solve_symmetric(S, r)
+            x, square = HP.T @ weighted, float(r @ weighted) / len(r)
+        if square <= most:
+            joint.update(HP, S, r)
+            self._move(-x)
+            self.observer.landmarks.merge(rows, copies)
+            self.remove(copies)
+            self.observer.set_reference(self.observer.points)
+        self._compress_if_large(0)
+        return square
+
+    def _moved_points(self, rows: IntArray, x: FloatArray) -> FloatArray:
+        """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
+        X = self.joint.chart.step(x).X
+        return np.asarray(se3.rotate(X.A, self.observer.points[rows]) + X.a[rows])
+
+    @property
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of the calibration's estimates."""
+        return self.joint.calibration_variances
+
+    def _compress_if_large(self, added: int) -> None:
+        """Go on with a covariance for many landmarks, unless they move or P has none of them."""
+        # Tags count by their columns: relinearising ends there, too.
+        count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
+        is_large = count > self.block.dense
+        may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
+        if self.joint.is_dense and is_large and not may_move:
+            self.joint = CompressedCovariance(self.joint, self.observer, self.block)
+
+    def _move(self, x: FloatArray) -> None:
+        step, observer = self.joint.chart.step(x), self.observer
+        self.calibration.shift(step.calibration)
+        X, moved = step.X, self.joint.active  # none in an exact map
+        turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
+        observer.correct(X.A, moved, X.a + turned)
+        if step.velocities is not None:
+            observer.correct_velocities(X.A, moved, step.velocities)
+        if step.turns is not None:
+            observer.orientations.turn(moved, so3.exp(step.turns))

@@ -1,1 +1,0 @@
-"""Measurements to events: moved into the base frame, and velocities made of poses."""

@@ -1,0 +1,87 @@
+"""How a sensor is really mounted, and by how much its ranges err: y = o + d + exp(ψ) e^s p.
+
+o is where the sensor is said to be, p from there to a point that it shows, in the body frame. ψ
+turns the sensor and d moves it, along the body's axes, and e^s is the factor of its ranges: seven
+``values`` of one sensor (7,), or of each point's (m, 7). y changes with them by
+
+    D = ∂y/∂(ψ, d, s) = [−[l]× J(ψ), I, l],   l = y − o − d.
+
+A residual takes D at the point that is predicted. At the measured one its noise would be in D as
+well: seen too far, a point would weigh more than seen too near, and the scale run away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.lie import so3
+
+_TINY = np.finfo(np.float64).tiny
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """What sensors showed of m points, before it was corrected by how they err; body frame."""
+
+    sensors: IntArray  # (m,) numbers of the sensors
+    origins: FloatArray  # (m, 3) o, metres
+    arms: FloatArray  # (m, 3) p, metres
+    orientations: FloatArray | None = None  # (m, 3, 3) of tags, zero for none
+
+    def select(self, mask: BoolArray) -> Sensed:
+        """Return the points that ``mask`` (m,) picks."""
+        Z = self.orientations
+        return Sensed(
+            self.sensors[mask],
+            self.origins[mask],
+            self.arms[mask],
+            None if Z is None else Z[mask],
+        )
+
+
+def joined_sensed(parts: list[Sensed]) -> Sensed:
+    """Return the points of several parts, one after the other, without orientations."""
+    return Sensed(
+        np.concatenate([part.sensors for part in parts]),
+        np.concatenate([part.origins for part in parts]),
+        np.concatenate([part.arms for part in parts]),
+    )
+
+
+def shown_at(values: FloatArray, sensed: Sensed) -> FloatArray:
+    """Return y (m, 3), metres, body frame."""
+    R, scales = so3.exp(values[..., :3]), np.exp(values[..., 6:])
+    turned = (R @ sensed.arms[:, :, None])[:, :, 0]
+    points: FloatArray = sensed.origins + values[..., 3:6] + scales * turned
+    return points
+
+
+def sensitivity(values: FloatArray, arms: FloatArray) -> FloatArray:
+    """Return D (m, 3, 7) for points at l = ``arms`` (m, 3) from the sensor."""
+    D = np.empty((len(arms), 3, 7))
+    D[:, :, :3] = -so3.hat(arms) @ so3.left_jacobian(values[..., :3])
+    D[:, :, 3:6], D[:, :, 6] = np.eye(3), arms
+    return D
+
+
+def turning(values: FloatArray) -> FloatArray:
+    """Return J(ψ) (…, 3, 7): how orientations exp(ψ) Z turn with the values (…, 7)."""
+    turns = np.zeros((*values.shape[:-1], 3, 7))
+    turns[..., :3] = so3.left_jacobian(values[..., :3])
+    return turns
+
+
+def directions_of(lines: FloatArray) -> FloatArray:
+    """Return unit vectors (m, 3, 3) along lines of sight, in azimuth and in elevation, as rows."""
+    lengths = np.linalg.norm(lines, axis=1, keepdims=True)
+    along = np.where(lengths > 0.0, lines / np.maximum(lengths, _TINY), [1.0, 0.0, 0.0])
+    level = np.hypot(along[:, 0], along[:, 1])
+    flat = np.maximum(level, _TINY)
+    azimuth = np.column_stack([-along[:, 1] / flat, along[:, 0] / flat, np.zeros(len(lines))])
+    azimuth[level < _TINY**0.5] = [0.0, 1.0, 0.0]
+    elevation = np.cross(along, azimuth)
+    directions: FloatArray = np.stack([along, azimuth, elevation], axis=1)
+    return directions

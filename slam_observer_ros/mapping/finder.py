@@ -1,0 +1,206 @@
+"""Finds the pose in a map by landmarks without ids: by how they lie to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import reduce
+import logging
+import math
+
+import numpy as np
+
+from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
+from slam_observer_ros.mapping.constellation import find_places, MAX_LOOKS
+from slam_observer_ros.mapping.landmark_map import LandmarkMap, MappedLandmarks
+from slam_observer_ros.mapping.map_alignment import AlikeMaps, Likeness, likeness_by_ids
+from slam_observer_ros.mapping.map_check import place_for_another, symmetries, turns_onto
+from slam_observer_ros.mapping.places import (
+    Anywhere,
+    Constellation,
+    Near,
+    Place,
+    PlacePrior,
+    Places,
+    Weighing,
+)
+from slam_observer_ros.tracking.state import State
+
+logger = logging.getLogger(__name__)
+
+MIN_COUNT = 2
+"""How often a landmark must have been seen: most false points are seen once."""
+
+MAX_SOUGHT = 12
+"""Landmarks by which places are searched for, those seen last."""
+
+MAX_WEIGHED = 60
+"""Landmarks by which the places that were found are weighed."""
+
+MAX_FITTING = 50
+"""Places that are weighed by all of these."""
+
+NEWS = 1.3
+"""How many times as often landmarks must have been seen before it is worth searching again."""
+
+
+def warn_of_symmetry(loaded: LandmarkMap, name: str) -> None:
+    """Log that a map looks the same when turned, and where one more landmark would change that."""
+    if not (same := symmetries(loaded)):
+        return
+    differ = int(np.count_nonzero(~same[0].is_same))
+    x, y, _ = place_for_another(loaded, same[0]).tolist()
+    finding = found(
+        'symmetric_map',
+        name=f' {name}' if name else '',
+        turn_deg=same[0].turn_deg,
+        but=f' but for {differ} landmarks' if differ else '',
+        consequence='is found only near these' if differ else "can't be found",
+        x=x,
+        y=y,
+    )
+    logger.warning('%s', finding)
+
+
+def _likeness(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
+    """Return how a map is to be moved to look as another, if their ids have not said so."""
+    if likeness_by_ids(known, other) is not None:
+        return None
+    found = turns_onto(known, other)
+    return max(found, key=lambda each: int(each.is_same.sum()), default=None)
+
+
+class Finder:
+    """Searches maps for the place where an estimate in a frame of its own is.
+
+    ``rough`` is a pose (4, 4) and its covariance (6, 6) if the place of that frame is roughly
+    known, in whichever map.
+    """
+
+    def __init__(
+        self,
+        maps: Sequence[LandmarkMap],
+        state: State,
+        rough: tuple[FloatArray, FloatArray] | None,
+    ) -> None:
+        self._maps = [_SearchedMap(known, state, rough) for known in maps]
+        self._ids = np.concatenate([known.ids for known in maps])
+        self._has_warned = False  # of maps that look alike, to points without ids
+        self.alike = AlikeMaps([], _likeness)
+        self._searched: tuple[int, int] | None = None
+        self.places: Places | None = None  # that fit, when it was searched last
+
+    def find(self, state: State) -> tuple[LandmarkMap, tuple[IntArray, IntArray]] | None:
+        """Return the map, landmarks (q,) of an estimate, and which of the map's (q,) they are.
+
+        None unless there is one place that fits, or if nothing much is new since the last search.
+        """
+        if not (rows := self._rows(state)).size or not self._is_due(state, rows):
+            return None
+        P = state.gains.joint_covariance(rows)
+        if P is None:
+            return None
+        p = state.axes.p
+        seen = Constellation(state.observer.points[rows], P[p:, p:], np.full(len(rows), -1))
+        ids = state.landmarks.ids[rows]
+        error_probability = state.settings.localization_error_probability
+        self.places = places = self._search(seen, ids, error_probability)
+        place = places.decided(error_probability)
+        if place is None:
+            return None
+        matched = place.rows >= 0
+        pairs = rows[matched], place.rows[matched]
+        return self._maps[place.map_index].loaded, pairs
+
+    def _rows(self, state: State) -> IntArray:
+        """Return the landmarks to go by, those seen last first; none if their ids are enough."""
+        landmarks = state.landmarks
+        has_no_id = is_automatic(landmarks.ids) & (landmarks.counts >= MIN_COUNT)
+        if has_no_id.any() and not self._has_warned:
+            self._has_warned = True
+            maps = [known.loaded for known in self._maps]
+            for loaded in maps:
+                warn_of_symmetry(loaded, loaded.name if len(maps) > 1 else '')
+            self.alike = AlikeMaps(maps, _likeness)
+        rows = np.flatnonzero(has_no_id | np.isin(landmarks.ids, self._ids))
+        are_ids_enough = len(self._maps) == 1 and not has_no_id.any()
+        if are_ids_enough or len(rows) <= state.axes.point:
+            return np.empty(0, dtype=np.int64)
+        return rows[np.argsort(-landmarks.last_seen_ns[rows], kind='stable')][:MAX_WEIGHED]
+
+    def _is_due(self, state: State, rows: IntArray) -> bool:
+        """Return whether a search may say more than the last one."""
+        seen_so_often = math.log(float(state.landmarks.counts[rows].sum()))
+        news = (len(rows), int(seen_so_often / math.log(NEWS)))
+        is_due = news != self._searched
+        self._searched = news
+        return is_due
+
+    def _search(self, seen: Constellation, ids: IntArray, error_probability: float) -> Places:
+        """Search by the landmarks seen last, and weigh what fits by all of them."""
+        reached = [known.mapped.within_reach(seen.points[:MAX_SOUGHT]) for known in self._maps]
+        near = reduce(np.intersect1d, reached)
+        parts = self._find_places(seen.select(near), ids[near], error_probability)
+        if len(near) < len(seen):
+            parts = {i: self._maps[i].weighed(part, seen, ids, near) for i, part in parts.items()}
+        return Places.in_several_maps(parts)
+
+    def _find_places(
+        self, sought: Constellation, ids: IntArray, error_probability: float
+    ) -> dict[int, Places]:
+        """Search all maps, that which was the most likely one last time first."""
+        best = 0 if self.places is None or not self.places.all else self.places.all[0].map_index
+        order = sorted(range(len(self._maps)), key=lambda i: i != best)
+        looks, rival = MAX_LOOKS // len(order), -math.inf
+        parts: dict[int, Places] = {}
+        # Those searched before the best one may have been left with two places that it makes
+        # unlikely.
+        for i in [*order, *order[:-1]]:
+            if i in parts and rival == _largest_mass(parts[i]):
+                break
+            known = self._maps[i]
+            seen = replace(sought, only=known.named(ids))
+            parts[i] = find_places(
+                known.mapped, seen, known.prior, error_probability, rival, looks
+            )
+            rival = max(rival, _largest_mass(parts[i]))
+        return parts
+
+
+class _SearchedMap:
+    """A map, and what a search of it needs."""
+
+    def __init__(
+        self, loaded: LandmarkMap, state: State, rough: tuple[FloatArray, FloatArray] | None
+    ) -> None:
+        self.loaded = loaded
+        covariances = loaded.covariances_or(state.settings.map_noise)
+        self.mapped = MappedLandmarks(loaded.world_points, covariances, state.axes)
+        self.prior: PlacePrior = (
+            Anywhere(self.mapped) if rough is None else Near(*rough, state.axes)
+        )
+
+    def weighed(self, places: Places, seen: Constellation, ids: IntArray, at: IntArray) -> Places:
+        """Return places that were found by points ``at`` (q,), weighed by all (m,)."""
+        weighing = Weighing(self.mapped, replace(seen, only=self.named(ids)), self.prior)
+        found: list[Place] = []
+        for place in places.all[:MAX_FITTING]:
+            rows = np.full(len(seen), -1)
+            rows[at] = place.rows
+            fitted = weighing.place(place.transform, rows)
+            if fitted is not None:
+                weighing.add(fitted, found)
+        return Places.weighed(found, weighing.log_none, places.is_complete)
+
+    def named(self, ids: IntArray) -> IntArray:
+        """Return the landmarks (m,) that ids name, −1 for none."""
+        known_ids = self.loaded.ids
+        order = np.argsort(known_ids)
+        at = order[np.searchsorted(known_ids, ids, sorter=order) % len(known_ids)]
+        return np.where((known_ids[at] == ids) & ~is_automatic(ids), at, -1)
+
+
+def _largest_mass(places: Places) -> float:
+    """Return ln of the mass of the most likely place."""
+    return places.all[0].log_mass if places.all else -math.inf

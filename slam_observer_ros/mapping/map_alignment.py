@@ -1,0 +1,258 @@
+"""The transform between the frames of two maps: by landmarks that both have, or by one tag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from itertools import combinations
+import logging
+
+import numpy as np
+
+from slam_observer_ros.common.findings import Finding, found
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.filter.known_landmarks import anchor, JITTER_M2, KnownLandmarks
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.lie.matrices import definite_inverse, solve_symmetric
+from slam_observer_ros.lie.se3 import rigid_alignment
+from slam_observer_ros.mapping.landmark_map import LandmarkMap, SAME_M, SAME_SHARE
+from slam_observer_ros.tracking.state import State
+
+logger = logging.getLogger(__name__)
+
+MAX_TURN_STD_RAD = 0.2
+"""Standard deviation about any axis beyond which landmarks don't determine the attitude.
+
+Three of them in a line leave the roll about it open; two that are close together, the heading.
+"""
+
+CONTRADICTION_SIGMAS = 4.0
+"""Landmarks whose misfit is as improbable as this contradict each other."""
+
+
+def find_transform(
+    source: FloatArray,
+    source_covariance: FloatArray,
+    target: KnownLandmarks,
+    axes: EstimatedAxes,
+) -> tuple[FloatArray, BoolArray] | None:
+    """Find the transform between the frames of two maps, even if some landmarks are wrong.
+
+    Parameters
+    ----------
+    source : FloatArray
+        (m, 3) landmarks in the robot's own frame, metres.
+    source_covariance : FloatArray
+        (p + m k, p + m k) covariance of the pose's error and theirs together, rad² and m².
+    target : KnownLandmarks
+        The same m landmarks in the other frame.
+    axes : EstimatedAxes
+        Whether they lie in space (k = 3) or in a plane (k = 2).
+
+    Returns
+    -------
+    tuple or None
+        Transform (4, 4) from the robot's frame to the other one, and the landmarks (m,) that
+        agree on it. None unless these are at least k and half of all, as of many landmarks some
+        few fit by chance, and determine the attitude.
+
+    """
+    p, k = axes.p, axes.point
+    J = axes.output_matrix(source).reshape(len(source) * k, p)
+    G = np.vstack([np.eye(p), J])
+    agree = np.ones(len(source), dtype=np.bool_)
+    while agree.sum() >= max(k, 0.5 * len(source)):
+        # Align the landmarks that are left.
+        rows = np.flatnonzero(np.append(np.ones(p, dtype=np.bool_), np.repeat(agree, k)))
+        P = source_covariance[np.ix_(rows, rows)]
+        known = target.select(agree)
+        T = _aligned(source[agree], P[p:, p:], known)
+        # Compare them in the robot's frame: do they determine the attitude, do they agree?
+        known = known.moved(se3.inverse(T))
+        there = known.covariance_on(axes)
+        r = (source[agree] - known.points)[:, :k]
+        if _turn_std_rad(P, G[rows], there, axes) > MAX_TURN_STD_RAD:
+            return None
+        misfit, doubts = _contradictions(G[rows[p:]], P[p:, p:] + there, r)
+        if misfit <= _improbable(r.size - p):
+            return T, agree
+        # Leave out the worst one.
+        agree[np.flatnonzero(agree)[np.argmax(doubts)]] = False
+    return None
+
+
+def _improbable(degrees_of_freedom: int) -> float:
+    """Return the χ² that is as improbable as ``CONTRADICTION_SIGMAS``."""
+    # scipy.stats has it too, but takes a second to import.
+    from scipy import special  # which few runs need
+
+    both_tails = 2.0 * special.ndtr(-CONTRADICTION_SIGMAS)
+    return float(special.chdtri(degrees_of_freedom, both_tails))
+
+
+def _aligned(source: FloatArray, own: FloatArray, target: KnownLandmarks) -> FloatArray:
+    """Return the transform (4, 4) that aligns landmarks weighted by how well each is known."""
+    variances = np.diagonal(own).reshape(len(source), -1).sum(axis=1)
+    variances = variances + np.trace(target.covariances, axis1=1, axis2=2) + JITTER_M2
+    return rigid_alignment(source, target.points, 1.0 / variances)
+
+
+def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:
+    """Return the standard deviation of the robot's attitude in a map, about the worst axis.
+
+    Parameters are as for :func:`slam_observer_ros.filter.known_landmarks.anchor`.
+    """
+    turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
+    try:
+        S = P[np.ix_(rows, rows)] + there
+        _, after = anchor(P, G, P[:, rows], S, G[rows], np.zeros(len(rows)))
+    except np.linalg.LinAlgError:
+        return np.inf
+    # Where landmarks leave a turn open, rounding decides whether its variance is +∞ or −∞.
+    return float(np.sqrt(np.abs(np.linalg.eigvalsh(after[:turns, :turns])).max()))
+
+
+def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float, FloatArray]:
+    """Return how badly differences (m, k) fit together, squared, and each by itself (m,).
+
+    Each is judged as in Baarda's data snooping, by what the others leave of it: Q r, with
+    Q = S⁻¹ − S⁻¹ J (Jᵀ S⁻¹ J)⁻¹ Jᵀ S⁻¹, in units of its standard deviation.
+    """
+    weights = definite_inverse(S + JITTER_M2 * np.eye(len(S)))
+    W = weights @ J
+    Q = weights - W @ solve_symmetric(J.T @ W, W.T)
+    left = Q @ r.ravel()
+    variances = np.maximum(np.diagonal(Q), 1e-6 * np.diagonal(weights))
+    return float(r.ravel() @ left), np.sum((left**2 / variances).reshape(r.shape), axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likeness:
+    """A motion after which landmarks are nearly where a map has them."""
+
+    transform: FloatArray  # (4, 4)
+    is_same: BoolArray  # (n,) which landmarks are then where others are
+
+    @property
+    def turn_deg(self) -> float:
+        """By how much it turns, degrees, 0 to 180."""
+        return float(np.rad2deg(np.linalg.norm(so3.log(self.transform[:3, :3]))))
+
+    @property
+    def moved(self) -> str:
+        """How it moves the map, in words that follow a comma; empty if it does not."""
+        turn_deg, shift_m = self.turn_deg, self.transform[:3, 3]
+        x, y, z = shift_m.tolist()
+        # Less is no other place, and may come of the errors of a few landmarks.
+        is_turned, is_shifted = turn_deg > LEAST_TURN_DEG, np.linalg.norm(shift_m) > SAME_M
+        turned = f', turned by {turn_deg:.0f}°' if is_turned else ''
+        joint = ' and' if is_turned else ','
+        return turned + (f'{joint} shifted by ({x:.1f}, {y:.1f}, {z:.1f}) m' if is_shifted else '')
+
+
+LEAST_TURN_DEG = 6.0
+"""Least turn about the vertical that makes another place."""
+
+
+def likeness_by_ids(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
+    """Return how a map is to be moved to be another, or a part of it, by their ids; or None."""
+    _, own, others = np.intersect1d(known.ids, other.ids, return_indices=True)
+    smaller = min(len(known.ids), len(other.ids))
+    needed = max(SAME_SHARE * smaller, LEAST_SAME)
+    points, targets = known.world_points[own], other.world_points[others]
+    is_same = np.ones(len(own), dtype=np.bool_)
+    while np.count_nonzero(is_same) >= needed:
+        T = rigid_alignment(points[is_same], targets[is_same])
+        off_m = np.linalg.norm(se3.transform(T, points) - targets, axis=1)
+        worst_m = float(off_m[is_same].max())
+        if worst_m <= SAME_M:
+            are_same = np.zeros(len(known.ids), dtype=np.bool_)
+            are_same[own[off_m <= SAME_M]] = True
+            return Likeness(T, are_same)
+        # Some that were moved shift all others, but by less than they are off themselves.
+        is_same &= off_m <= 0.5 * worst_m
+    return None
+
+
+LEAST_SAME = 3
+"""Landmarks that show that two maps are one place: of two alone only the distance has to fit."""
+
+
+class AlikeMaps:
+    """Which of several maps are another one, moved; of each that is logged once."""
+
+    def __init__(
+        self,
+        maps: Sequence[LandmarkMap],
+        likeness: Callable[[LandmarkMap, LandmarkMap], Likeness | None],
+    ) -> None:
+        self._findings: dict[tuple[int, int], Finding] = {}
+        for (i, first), (j, second) in combinations(enumerate(maps), 2):
+            if (alike := likeness(first, second)) is None:
+                continue
+            self._findings[i, j] = finding = found(
+                'alike_maps',
+                other=first.name,
+                name=second.name,
+                count=np.count_nonzero(alike.is_same),
+                moved=alike.moved,
+            )
+            if not any((k, j) in self._findings for k in range(i)):
+                logger.warning('%s', finding)
+
+    def among(self, maps: Iterable[int]) -> Finding | None:
+        """Return what is to be said of two of these maps, by number, that are alike; or None."""
+        pairs = combinations(sorted(set(maps)), 2)
+        return next((self._findings[pair] for pair in pairs if pair in self._findings), None)
+
+
+SIGHTINGS = 2
+"""Sightings of a tag that must agree: a single one may be flipped."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagPose:
+    """What a tag says of where the robot is."""
+
+    tag_id: int
+    pose: FloatArray  # (4, 4) in the map
+    covariance: FloatArray  # (6, 6) of rotation vector and position, rad² and m², map axes
+    known: LandmarkMap  # the map
+
+
+def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> TagPose | None:
+    """Return the pose in a map by the tag that says it best, but for ``refused`` ids; or None."""
+    tags, R, sigmas = state.observer.orientations, known.orientations, known.orientation_sigmas
+    if R is None or sigmas is None:
+        return None
+    # Tags that both have, and that were seen the same way each time.
+    rows, landmarks = state.landmarks.rows_of(known.ids), state.landmarks
+    shared = np.flatnonzero((rows >= 0) & R.any(axis=(1, 2)))
+    shared = shared[~np.isin(known.ids[shared], list(refused))]
+    own = rows[shared]
+    is_sure = tags.are_known[own] & (tags.counts[own] >= SIGHTINGS) & (tags.rejections[own] == 0)
+    is_sure &= landmarks.counts[own] >= SIGHTINGS
+    shared, own = shared[is_sure], own[is_sure]
+    if not len(own):
+        return None
+    turn_stds = np.hypot(state.known_errors.orientation_sigmas(own), sigmas[shared])
+    best = int(np.argmin(turn_stds))
+    if turn_stds[best] > MAX_TURN_STD_RAD:
+        return None
+    at, row, A = shared[best], own[best : best + 1], state.observer.A
+    # From the frame of P° to the map: by how the tag is turned, and where it is.
+    turn = R[at] @ state.known_errors.orientation_matrices(row)[0].T
+    lever = turn @ (A[:3, 3] - state.observer.points[row[0]])
+    pose = se3.pose(turn @ A[:3, :3], known.world_points[at] + lever)
+    # An error of the tag's turn moves the robot about it.
+    J = np.vstack([np.eye(3), -so3.hat(lever)])
+    covariance = turn_stds[best] ** 2 * J @ J.T
+    covariance[3:, 3:] += known.covariances_or(state.settings.map_noise)[at]
+    seen, k = state.configuration_covariance(row), state.axes.point
+    if seen is not None:
+        relative = np.zeros((3, 3))
+        relative[:k, :k] = seen
+        covariance[3:, 3:] += pose[:3, :3] @ relative @ pose[:3, :3].T
+    return TagPose(int(known.ids[at]), pose, covariance, known)

@@ -1,0 +1,375 @@
+"""Calibration as part of the state: of the velocity, by axis, and of each sensor of landmarks.
+
+V_true(t) = M V(t − τ) + b, where M has the scale factors 1 + s on its diagonal. A velocity shows
+in observations later than its stamp, by the delay τ: a command takes a while to be obeyed, and an
+image a while to be stamped. A sensor's part, ψ, d and s of
+:mod:`slam_observer_ros.lie.sensor_mounting`, begins with the first observation from its
+frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from copy import copy
+from dataclasses import replace
+import math
+from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
+
+import numpy as np
+
+from slam_observer_ros.common.stamps import to_ns
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.models.held_velocities import HeldUntil, HeldVelocities
+from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+MOVES = 6
+"""Column of b in [M b] (6, 7), which is multiplied by 1 where a velocity is not zero."""
+
+DELAY, SENSORS, EACH = 42, 43, 7
+"""Where τ is behind [M b], row by row, and behind it ``EACH`` values of each sensor."""
+
+MIN_DELAY_S = -0.2
+"""Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier.
+How the robot moves so much later is not known yet when it is needed: without a limit the
+estimate, which can't make up for it, would stray ever further.
+"""
+
+
+class Entry(NamedTuple):
+    """A value that may be calibrated. ``parameter`` states it, ``parameter``_stddev how sure."""
+
+    name: str
+    parameter: str
+    axis: int | None  # which of x, y and z of the parameter; None where that is one number
+    place: int  # in [M b] and τ (43,), or in the values (7,) of a sensor
+    unit: str
+
+
+def _entries(parameter: str, places: Iterable[int]) -> list[Entry]:
+    """Return what a parameter states of the values at ``places``: of one, or of x, y and z."""
+    field = Settings.__dataclass_fields__[f'{parameter}_stddev']
+    each = [('_x', 0), ('_y', 1), ('_z', 2)] if isinstance(field.default, tuple) else [('', None)]
+    return [
+        Entry(parameter + suffix, parameter, axis, place, field.metadata['unit'])
+        for (suffix, axis), place in zip(each, places, strict=True)
+    ]
+
+
+_PLACES = np.arange(DELAY).reshape(6, 7)  # of [M b]
+_SCALES, _BIASES = np.diagonal(_PLACES).tolist(), _PLACES[:, MOVES].tolist()
+OF_VELOCITY = (
+    *_entries('angular_scale', _SCALES[:3]),
+    *_entries('linear_scale', _SCALES[3:]),
+    *_entries('angular_bias', _BIASES[:3]),
+    *_entries('linear_bias', _BIASES[3:]),
+    *_entries(DELAY_NAME, [DELAY]),
+)
+"""All that may be calibrated of velocities, the delay last: one more entry of M is a row more."""
+
+OF_SENSOR = (
+    *_entries('sensor_rotation', range(3)),
+    *_entries('sensor_translation', range(3, 6)),
+    *_entries('range_scale', [SCALE := 6]),
+)
+"""All that may be calibrated of a sensor: ψ, d and e^s."""
+
+VELOCITY_STDDEVS, SENSOR_STDDEVS = (
+    tuple(dict.fromkeys(f'{entry.parameter}_stddev' for entry in entries))
+    for entries in (OF_VELOCITY, OF_SENSOR)
+)
+"""Parameters that say how far these may be off, 0 for not at all."""
+
+
+class CalibrationOwner(Protocol):
+    """What has the values (43 + 7 s,) of velocities, [M b] and τ, and of s sensors."""
+
+    calibration: FloatArray
+
+
+class Calibration:
+    """What an ``owner``'s values do, and which c of them are estimated: s, b and τ, then sensors'.
+
+    These are the ones whose uncertainty is not 0. ``initial_variances`` (c,) grow by
+    ``drift_covariance`` (c, c) a second, if one ``drifts``; ``delay_error_ns`` is the standard
+    deviation of τ at the start, 0 where it is not estimated. ``sensors`` are the frames of those
+    seen so far, and ``of_sensor`` (c_s,) says which of the seven values of each are estimated;
+    ``corrects_points`` says whether what they show is not taken as it comes.
+    """
+
+    def __init__(self, owner: CalibrationOwner, settings: Settings, axes: EstimatedAxes) -> None:
+        self._owner, self.axes, self._settings = owner, axes, settings
+        errors, is_possible = _of_velocity(settings, '_stddev'), np.zeros((6, 7))
+        is_possible[axes.pose, axes.pose] = is_possible[axes.pose, MOVES] = 1.0
+        errors[:DELAY] *= is_possible.ravel()
+        self.velocity_places: IntArray = np.array(
+            [entry.place for entry in OF_VELOCITY if errors[entry.place] > 0.0], dtype=np.int64
+        )
+        rates = self.velocity_places[self.velocity_places < DELAY]
+        self._rows, self._columns = rates // 7, rates % 7
+        stated, deviations = _of_a_sensor(settings)
+        of_sensor = np.append(np.arange(6)[axes.pose], SCALE)
+        self.of_sensor: IntArray = of_sensor[deviations[of_sensor] > 0.0]
+        self._stated, self._sensor_variances = stated, deviations[self.of_sensor] ** 2
+        self.sensors: tuple[str, ...] = ()
+        self.corrects_points = bool(settings.range_is_depth or stated.any() or len(self.of_sensor))
+        self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
+        self.of_velocity = len(self.velocity_places)  # how many of the c are no sensor's
+        # (c,) which of the values these are, and all as they were at the start
+        self._places, self._nominal = self.velocity_places, stated_of_velocity(settings)
+        owner.calibration = self._nominal.copy()
+        self._set_variances(errors[self._places] ** 2)
+
+    def of(self, owner: CalibrationOwner) -> Self:
+        """Return the calibration of a copy of the owner."""
+        other = copy(self)
+        other._owner = owner
+        return other
+
+    def _set_variances(self, variances: FloatArray) -> None:
+        self.count, self.initial_variances = len(variances), variances
+        self.drift_covariance = np.diag(variances * self._settings.calibration_drift**2)
+        self.drifts = bool(self.drift_covariance.any())
+
+    def add_sensor(self, frame: str) -> FloatArray:
+        """Append the estimated entries of a new frame's sensor; return their variances (c_s,)."""
+        more, owner = len(self._nominal) + self.of_sensor, self._owner
+        self.sensors = (*self.sensors, frame)
+        self._places = np.append(self._places, more)
+        self._nominal = np.append(self._nominal, self._stated)
+        owner.calibration = np.append(owner.calibration, self._stated)
+        self._set_variances(np.append(self.initial_variances, self._sensor_variances))
+        variances: FloatArray = self._sensor_variances
+        return variances
+
+    @property
+    def values(self) -> FloatArray:
+        """(c,) estimates: scale factors 1 + s, biases b, the delay τ in seconds; then sensors'."""
+        values: FloatArray = self._owner.calibration.take(self._places)
+        return values
+
+    @property
+    def rates(self) -> FloatArray:
+        """(6, 7) [M b], as a view."""
+        rates: FloatArray = self._owner.calibration[:DELAY].reshape(6, 7)
+        return rates
+
+    @property
+    def delay_ns(self) -> int:
+        """The delay τ; where it is negative the latest velocity is held for longer."""
+        return to_ns(float(self._owner.calibration[DELAY]))
+
+    @property
+    def calibrates_sensors(self) -> bool:
+        """Whether some of the c entries belong to sensors."""
+        return self.count > self.of_velocity
+
+    def sensor(self, frame: str) -> FloatArray:
+        """Return ψ, d and s (7,) of a sensor, as a view."""
+        first = SENSORS + EACH * self.sensors.index(frame)
+        values: FloatArray = self._owner.calibration[first : first + EACH]
+        return values
+
+    def columns(self, frame: str) -> slice:
+        """Return which of the c entries belong to a sensor."""
+        each = len(self.of_sensor)
+        first = self.of_velocity + each * self.sensors.index(frame)
+        return slice(first, first + each)
+
+    def sensor_columns(self) -> tuple[FloatArray, IntArray]:
+        """Return ψ, d and s of all sensors (s, 7), and which of the c entries they are, or −1."""
+        values = self._owner.calibration[SENSORS:].reshape(-1, EACH)
+        columns = np.full(values.shape, -1)
+        columns[:, self.of_sensor] = np.arange(self.of_velocity, self.count).reshape(
+            len(values), -1
+        )
+        return values.copy(), columns
+
+    def estimates(
+        self, variances: FloatArray, values: FloatArray | None = None
+    ) -> list[CalibrationEstimate]:
+        """Return the estimates with ``variances`` (c,), what the filter knows of them.
+
+        Or ``values`` (c,) in place of the present ones.
+        """
+        values = self.values if values is None else values
+        stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
+        each = zip(self._places.tolist(), values, variances, stated, strict=True)
+        return [self._estimate(*part) for part in each]
+
+    def _estimate(
+        self, place: int, value: float, variance: float, stated: float
+    ) -> CalibrationEstimate:
+        nominal, factor = self._nominal[place], 1.0
+        if place < SENSORS:
+            name, unit = next(
+                (entry.name, entry.unit) for entry in OF_VELOCITY if entry.place == place
+            )
+        else:
+            sensor, number = divmod(place - SENSORS, EACH)
+            entry, frame = OF_SENSOR[number], self.sensors[sensor]
+            name, unit = entry.name + f'/{frame}' * bool(frame), entry.unit
+            if number == SCALE:  # s is its logarithm
+                value, nominal = math.exp(value), math.exp(nominal)
+                factor = value
+        return CalibrationEstimate(
+            name,
+            float(value),
+            float(factor * np.sqrt(variance)),
+            unit,
+            nominal=float(nominal),
+            stated=float(factor * stated),
+        )
+
+    def apply(self, body_velocities: FloatArray) -> FloatArray:
+        """Return velocities (…, 6) as M V + b; exact zeros stay so."""
+        return calibrated(self.rates, body_velocities)
+
+    def apply_to_covariance(
+        self, covariance: FloatArray, body_velocity: FloatArray, variances: FloatArray
+    ) -> FloatArray:
+        """Return the covariance (6, 6) of a calibrated velocity, given the velocity's own.
+
+        ``variances`` (c,) are of the estimates, by the filter.
+        """
+        M = self.rates[:, :MOVES]
+        applied: FloatArray = M @ covariance @ M.T
+        shares = variances[: len(self._rows)] * self._rates(body_velocity[None])[0] ** 2
+        applied.ravel()[::7] += np.bincount(self._rows, shares, minlength=6)
+        return applied
+
+    def sensitivity(
+        self,
+        Ad: FloatArray,
+        measured_velocities: FloatArray,
+        dt_s: FloatArray,
+        at_ends: FloatArray | None,
+    ) -> FloatArray:
+        """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
+
+        It follows from ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay that is too long by τ̃, by which
+        velocities were taken from an interval that begins and ends τ̃ earlier. ``Ad``
+        (k + 1, p, 6) holds the estimated rows of Ad_Â; the other arguments are as in
+        :class:`.Motion`.
+        """
+        if not self.count:
+            return np.empty((Ad.shape[1], 0))
+        shares = se3.at_poses(self._rates(measured_velocities) * dt_s[:, None])
+        of_rates = Ad.take(self._rows, axis=2) * shares[:, None, :]
+        F = np.zeros((Ad.shape[1], self.count))
+        F[:, : len(self._rows)] = of_rates.sum(axis=0)
+        if self.delay_error_ns and at_ends is not None:
+            first, last = self.apply(at_ends)
+            F[:, self.of_velocity - 1] = Ad[0].dot(first) - Ad[-1].dot(last)
+        return F
+
+    def sensitivity_until(
+        self,
+        Ad: FloatArray,
+        held: HeldUntil,
+        Ad_at_ends: FloatArray,
+        at_ends: FloatArray | None,
+    ) -> FloatArray:
+        """Return :meth:`sensitivity` until each of s instants (s, p, c).
+
+        ``Ad`` (k + 1, p, 6) is along the whole pieces, ``Ad_at_ends`` (s, p, 6) at the instants.
+        """
+        counts, rates = held.counts, len(self._rows)
+        of_rates = Ad[:, :, self._rows]
+        shares = self._shares(held.whole)
+        until = se3.summed_until((of_rates[:-1] + of_rates[1:]) * shares)[counts]
+        last = of_rates[counts] + Ad_at_ends[:, :, self._rows]
+        F = np.zeros((len(counts), Ad.shape[1], self.count))
+        F[:, :, :rates] = until + last * self._shares(held.last)
+        if self.delay_error_ns and at_ends is not None:
+            starts, ends = self.apply(at_ends)
+            F[:, :, self.of_velocity - 1] = (
+                starts @ Ad[0].T - (Ad_at_ends @ ends[:, :, None])[:, :, 0]
+            )
+        return F
+
+    def _shares(self, held: HeldVelocities) -> FloatArray:
+        """Return (k, 1, …) half of how far each scale and bias moves the robot in a piece."""
+        rates = self._rates(held.body_velocities)
+        shares: FloatArray = (0.5 * rates * held.dt_s[:, None])[:, None, :]
+        return shares
+
+    def _rates(self, measured_velocities: FloatArray) -> FloatArray:
+        """Return (k, …) how fast each entry of [M b] moves the robot per unit of its error."""
+        rates: FloatArray = with_moves(measured_velocities).take(self._columns, axis=1)
+        return rates
+
+    def initial_covariance(self) -> FloatArray:
+        """Return the covariance (p + c, p + c) of (ε, c̃) at the start, without error of Â."""
+        return np.diag(np.append(np.zeros(self.axes.p), self.initial_variances))
+
+    def shift(self, change: FloatArray) -> None:
+        """Add ``change`` (c,) to the estimates."""
+        self._owner.calibration[self._places] = self.shifted(change)
+
+    def shifted(self, change: FloatArray) -> FloatArray:
+        """Return the estimates (c,) after that; the delay stays within what can be made up for."""
+        values: FloatArray = self.values + change
+        if self.delay_error_ns:
+            least_s = min(MIN_DELAY_S, self._nominal[DELAY])
+            delay = self.of_velocity - 1
+            values[delay] = min(max(values[delay], least_s), MAX_DELAY_S)
+        return values
+
+
+def with_moves(body_velocities: FloatArray) -> FloatArray:
+    """Return (V, 1) (…, 7) of velocities V (…, 6), or zero where these are exactly zero."""
+    velocities = np.empty((*body_velocities.shape[:-1], 7))
+    velocities[..., :MOVES] = body_velocities
+    velocities[..., MOVES] = _moves(body_velocities)
+    return velocities
+
+
+def _moves(body_velocities: FloatArray) -> BoolArray:
+    """Return whether velocities (…, 6) are not exactly zero (…)."""
+    return np.asarray(body_velocities.any(axis=-1))
+
+
+def calibrated(rates: FloatArray, body_velocities: FloatArray) -> FloatArray:
+    """Return velocities (…, 6) as M V + b, of [M b] (6, 7); exact zeros stay so."""
+    # Wheels that stand turn no robot, however unlike, and no gyroscope gives zero on all axes.
+    biases = _moves(body_velocities)[..., None] * rates[:, MOVES]
+    velocities: FloatArray = body_velocities @ rates[:, :MOVES].T + biases
+    return velocities
+
+
+def stated_of_velocity(settings: Settings) -> FloatArray:
+    """Return what the settings state of the velocity (43,): [M b] and τ."""
+    return _of_velocity(settings, '')
+
+
+def _of_velocity(settings: Settings, suffix: str) -> FloatArray:
+    """Return what the parameters whose names end in ``suffix`` say of [M b] and τ (43,)."""
+    values = np.zeros(SENSORS)
+    for entry in OF_VELOCITY:
+        stated = getattr(settings, entry.parameter + suffix)
+        values[entry.place] = stated if entry.axis is None else stated[entry.axis]
+    return values
+
+
+def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
+    """Return ψ, d and s (7,) of a sensor as stated, and their standard deviations (7,)."""
+    deviations = [
+        *settings.sensor_rotation_stddev,
+        *settings.sensor_translation_stddev,
+        settings.range_scale_stddev / settings.range_scale,
+    ]
+    return np.append(np.zeros(6), math.log(settings.range_scale)), np.array(deviations)
+
+
+def without_calibration(settings: Settings) -> Settings:
+    """Return settings that estimate nothing of the calibration, as stated as it may be."""
+    zero: dict[bool, Any] = {True: (0.0, 0.0, 0.0), False: 0.0}
+    stddevs = (*SENSOR_STDDEVS, *VELOCITY_STDDEVS)
+    are_vectors = {name: isinstance(getattr(settings, name), tuple) for name in stddevs}
+    return replace(settings, **{name: zero[is_vector] for name, is_vector in are_vectors.items()})

@@ -1,0 +1,359 @@
+"""Noise of velocities, from the settings or from the messages, and how far it is stated wrong.
+
+Turning and driving have a factor ρ_j of the variance each, found by maximum likelihood of the
+residuals r before the gate, S = H P Hᵀ + R their covariance. The motion since the observation
+before has added M_j = C N_j Cᵀ to it, N_j (p, p) to the covariance of ε, C_i = [−[ŷ_i]×, I]. With
+θ_j = ln ρ_j the score and the Fisher information of an observation are
+
+    g_j = ½ (w rᵀ S⁻¹ M_j S⁻¹ r − tr S⁻¹ M_j),      F_jk = ½ tr(S⁻¹ M_j S⁻¹ M_k),
+
+and θ ← θ + (F̄ + I)⁻¹ (g − θ/n): F̄ is the sum of F with a memory of n observations, and I the
+information of a prior, θ_j ~ N(0, 1). M_j has the rank of N_j, so u = Cᵀ S⁻¹ r and G = Cᵀ S⁻¹ C
+are enough: rᵀ S⁻¹ M_j S⁻¹ r = uᵀ N_j u, tr S⁻¹ M_j = tr N_j G, 2 F_jk = tr N_j G N_k G.
+
+A slip, a robot that was carried, and outliers are no noise of the odometry: points beyond the gate
+are left out where most are within it, and the weight w lets no observation be further off than
+one in a hundred is. Nothing is learnt where the odometry says that the robot stands, nor across
+gaps and slips, whose noise is stated apart. The points' noise has no factor: where errors last,
+innovations are small while errors are large.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import lru_cache
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from slam_observer_ros.common.digits import significant
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.estimates import MotionFactor
+from slam_observer_ros.lie.matrices import (
+    diagonal_blocks,
+    limited,
+    mahalanobis,
+    solve_definite,
+)
+from slam_observer_ros.models.held_velocities import averaged, HeldVelocities
+from slam_observer_ros.settings.estimator_settings import Settings, Vector3
+
+MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
+"""Standard deviations of a velocity beyond which a message only says 'unknown'.
+
+No robot turns or moves as fast.
+"""
+
+MAX_GAP_ERRORS = np.repeat([np.pi, 1000.0], 3)
+"""Standard deviations of a motion in one gap, rad and m: it is as unknown as it can be.
+
+More would only drown all else that is known in rounding.
+"""
+
+SPEED_WINDOW_S = 1.0
+"""Time over which a velocity is averaged, as its error may be in proportion to it."""
+
+MEMORY = 300
+"""Observations over which the factors are found: they follow a change of the ground."""
+
+MAX_STEP = 0.5
+"""Change of ln ρ by one observation, at most."""
+
+LEAST_LOGARITHM, LARGEST_LOGARITHM = math.log(1e-2), math.log(1e3)
+"""Of ρ: a tenth to thirty times the standard deviation that is stated."""
+
+RARE = 2.33
+"""Standard deviations beyond which one in a hundred is."""
+
+LEAST = {'stated': math.inf, 'at_least_stated': 0.0, 'auto': -math.inf}
+"""Least ln ρ that is applied, by ``motion_noise_factor``; 'stated' applies none."""
+
+KINDS = {'turning': 'angular', 'driving': 'linear'}
+"""The motions that have a factor, and how the names of their noise begin."""
+
+_IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
+
+PRIOR_DEVIATION = 0.5
+"""Of the logarithm of a factor of the standard deviation at the start: half as for θ."""
+
+
+class MotionFigures(NamedTuple):
+    """How far velocities may be off."""
+
+    densities: FloatArray  # (6,) variances of the motion per second, rad² and m²
+    scales: FloatArray  # (6,) the same in proportion to the mean velocity, its square root
+    factors: FloatArray  # (2,) of both, for turning and driving
+
+
+class Factors(NamedTuple):
+    """From what the factors of the noise of the motion are found, changed in place."""
+
+    shares: FloatArray  # (2, p, p) N_j of the motion since the last observation
+    logs: FloatArray  # (2,) θ
+    information: FloatArray  # (2, 2) F̄
+    applied: FloatArray  # (2,)
+    least: float  # least θ that is applied
+
+
+class MotionNoise:
+    """How far motions may be off: noise densities of the settings, or covariances of messages.
+
+    Either of them times the ``factors`` that were found for turning and driving.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = s = settings
+        self.factors = MotionFactors(settings)
+        self._unknown_squared = (
+            np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3) ** 2
+        )
+        self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
+        self._has_scale = bool(self._scale.any())
+
+    def copy(self) -> MotionNoise:
+        """Return an independent copy."""
+        other = copy(self)
+        other.factors = copy(self.factors)  # whose arrays are never changed in place
+        return other
+
+    def covariances(self, held: HeldVelocities) -> FloatArray:
+        """Return what k motions may be off by: (k, 6, 6), rad² and m²."""
+        some_are_stated = np.count_nonzero(held.is_stated)
+        variances = motion_variances(
+            held.body_velocities, held.dt_s, held.before_s, held.usual_s, self.figures
+        )
+        if some_are_stated:
+            variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
+        # In a gap the robot may do anything that is allowed.
+        if np.count_nonzero(held.gap_s):
+            variances += np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
+        covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
+        if some_are_stated:  # of angular and linear part one may have none
+            covariances += stated_motion_covariances(
+                held.covariances, held.dt_s, held.before_s, self.factors.applied
+            )
+        return covariances
+
+    @property
+    def figures(self) -> MotionFigures:
+        """How far velocities without a stated covariance may be off now."""
+        s = self._settings
+        densities = _squares(s.angular_velocity_noise, s.linear_velocity_noise)
+        return MotionFigures(densities, self._scale, self.factors.applied)
+
+    def is_summed(self, held: HeldVelocities) -> bool:
+        """Return whether what one motion may be off by does not depend on others."""
+        last_longer = _some_last_longer(held.before_s + held.dt_s[:, None], held.usual_s)
+        return not (self._has_scale or last_longer)
+
+    def velocity_covariance(self, held: HeldVelocities) -> FloatArray:
+        """Return what a single velocity may be off by: (6, 6), rad²/s² and m²/s²."""
+        covariance: FloatArray = self.covariances(held)[0] / (held.dt_s[0] + held.gap_s[0]) ** 2
+        return covariance
+
+
+@lru_cache(maxsize=8)
+def _squares(angular: Vector3, linear: Vector3) -> FloatArray:
+    squares = np.array([*angular, *linear]) ** 2
+    squares.setflags(write=False)
+    return squares
+
+
+def _some_last_longer(until_s: FloatArray, usual_s: FloatArray) -> bool:
+    return bool(np.count_nonzero(until_s > usual_s))
+
+
+def motion_variances(
+    V: FloatArray,
+    dt_s: FloatArray,
+    before_s: FloatArray,
+    usual_s: FloatArray,
+    figures: MotionFigures,
+) -> FloatArray:
+    """Return the variances (k, 6) of what velocities (k, 6) without a stated covariance move by.
+
+    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), and for ``usual_s`` (2,) as a rule,
+    seconds.
+    """
+    # White noise of the stated density, and in proportion to the mean speed: a single message is
+    # noisy itself, and its square too large.
+    variances = figures.densities * _white_s(before_s, dt_s[:, None], usual_s)
+    if np.count_nonzero(figures.scales):
+        variances += (figures.scales * averaged(V, dt_s, SPEED_WINDOW_S)) ** 2 * dt_s[:, None]
+    grown: FloatArray = variances * figures.factors.repeat(3)
+    return grown
+
+
+def stated_motion_covariances(
+    covariances: FloatArray, dt_s: FloatArray, before_s: FloatArray, factors: FloatArray
+) -> FloatArray:
+    """Return covariances (k, 6, 6) of motions by velocities with stated covariances (k, 6, 6).
+
+    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), seconds. A velocity has one error
+    for as long as it is held, and the next message another one: held for t it has moved the robot
+    by t times its error, in however many motions.
+    """
+    squared = dt_s[:, None] * (2.0 * before_s + dt_s[:, None])  # (before + dt)² − before²
+    grown_s = np.repeat(np.sqrt(squared * factors), 3, axis=1)
+    stated = limited(covariances, MAX_SPEED_ERRORS)
+    grown: FloatArray = grown_s[:, :, None] * stated * grown_s[:, None, :]
+    return grown
+
+
+def _white_s(before_s: FloatArray, dt_s: FloatArray, usual_s: FloatArray) -> FloatArray:
+    """Return variances over their density: (k, 6), or ``dt_s`` (k, 1) if one for all axes.
+
+    The density belongs to errors which are new in each message. Held for t, longer than the
+    usual T, one of them has moved the robot by t/T times as much: t²/T, not t. Slip is as before.
+    """
+    until_s = before_s + dt_s
+    if not _some_last_longer(until_s, usual_s):  # as nearly always
+        return dt_s
+    grown_s = until_s * np.maximum(until_s / usual_s, 1.0)
+    grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
+    return np.repeat(grown_s, 3, axis=1)
+
+
+def beyond_driving(points: FloatArray, residuals: FloatArray, settings: Settings) -> BoolArray:
+    """Return which points (m, 3) are further off than the noise of driving explains.
+
+    By the gate, and the noise of a second of driving, after which a robot whose velocity is zero
+    is taken to stand. What is off by less is an error of the sensor, which stays while it does.
+    ``residuals`` are (m, 3), metres.
+    """
+    turned_m = np.linalg.norm(points, axis=1) * max(settings.angular_velocity_noise)
+    noise_m = np.hypot(max(settings.linear_velocity_noise), turned_m)
+    off_m = np.linalg.norm(residuals, axis=1)
+    return np.asarray(off_m > settings.rejection_threshold * noise_m)
+
+
+class MotionFactors:
+    """Factors ρ of the variances of turning and driving, and what they are found from."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._least = LEAST[settings.motion_noise_factor]
+        # (2,) factors of the variances in force: of turning, and of driving
+        self.applied: FloatArray = np.ones(2)
+        self._logs = np.zeros(2)  # θ
+        self._information = np.zeros((2, 2))  # F̄
+        self._found = 0  # observations that they were found from
+        # (2, p, p) N_j of the motion since the last one, none at first; None if unknown.
+        self._shares: FloatArray | None = np.zeros(())
+
+    @property
+    def estimates(self) -> list[MotionFactor]:
+        """What was found out, as factors of standard deviations; nothing before the first."""
+        if not self._found:
+            return []
+        deviations = 0.5 * np.sqrt(np.diagonal(np.linalg.inv(self._information + _PRIOR)))
+        factors, applied = np.exp(0.5 * self._logs).tolist(), np.sqrt(self.applied).tolist()
+        each = zip(KINDS, factors, deviations.tolist(), applied, strict=True)
+        return [
+            MotionFactor(name, factor, deviation, applied, proposed(name, factor, self._settings))
+            for name, factor, deviation, applied in each
+        ]
+
+    def move(self, shares: FloatArray | None) -> None:
+        """Take in N_j (2, p, p) of a motion, as it was applied; None if that says nothing."""
+        self._shares = None if shares is None or self._shares is None else self._shares + shares
+
+    def learn(self, r: FloatArray, S: FloatArray, C: FloatArray) -> None:
+        """Take in residuals r (m, k), metres, with S (m k, m k) and C (m, k, p), as they are used.
+
+        They are of the motions since the last time.
+        """
+        shares = self._shares
+        self.forget_motion()
+        if shares is None or not shares.ndim:
+            return
+        # As the likelihood at θ has it, which may be less than is applied.
+        ratios = np.exp(self._logs) / self.applied
+        N = ratios[:, None, None] * shares
+        C = C.reshape(-1, C.shape[2])
+        if np.count_nonzero(ratios != 1.0):
+            S = S + C.dot((N - shares).sum(axis=0)).dot(C.T)
+        self._information, self._logs = learnt(
+            self._logs, self._information, *self._score(r, S, C, N)
+        )
+        if self._least < math.inf:
+            self.applied = np.exp(np.maximum(self._logs, self._least))
+        self._found += 1
+
+    def flat(self) -> Factors | None:
+        """Return the factors, and the motion to learn from, as plain arrays; None without one."""
+        if self._shares is None or not self._shares.ndim:
+            return None
+        return Factors(
+            self._shares,
+            self._logs.copy(),
+            self._information.copy(),
+            self.applied.copy(),
+            self._least,
+        )
+
+    def take(self, factors: Factors | None) -> None:
+        """Take over factors of :meth:`flat` that have learnt."""
+        self.forget_motion()
+        if factors is not None:
+            self._logs, self._information = factors.logs, factors.information
+            self.applied = factors.applied
+            self._found += 1
+
+    def forget_motion(self) -> None:
+        """Learn nothing of the motion until now from the next observation."""
+        self._shares = np.zeros(())
+
+    def _score(
+        self, r: FloatArray, S: FloatArray, C: FloatArray, N: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return g (2,) and F (2, 2)."""
+        S_inv_r, S_inv_C = np.split(
+            solve_definite(S, np.column_stack([r.ravel(), C])), [1], axis=1
+        )
+        squared, gate = r.ravel().dot(S_inv_r)[0], self._settings.rejection_threshold
+        # No residual is further out than all of them together are.
+        if squared > gate**2:
+            k = r.shape[1]
+            passed = mahalanobis(r, diagonal_blocks(S, k)) <= gate
+            if len(r) < 2 * np.count_nonzero(passed) < 2 * len(r):
+                used = np.flatnonzero(np.repeat(passed, k))
+                return self._score(r[passed], S[np.ix_(used, used)], C[used], N)
+        return score(C.T.dot(S_inv_r)[:, 0], C.T.dot(S_inv_C), N, squared, r.size)
+
+
+def proposed(name: str, factor: float, settings: Settings) -> str:
+    """Return the settings that state a factor of the noise of ``'turning'`` or ``'driving'``."""
+    names = [f'{KINDS[name]}_velocity_noise', f'{KINDS[name]}_scale_noise']
+    stated = {each: getattr(settings, each) for each in names}
+    return ', '.join(
+        f'{each}: [{", ".join(significant(factor * value, 2) for value in values)}]'
+        for each, values in stated.items()
+        if any(values)
+    )
+
+
+def score(
+    u: FloatArray, G: FloatArray, N: FloatArray, squared: float, q: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return g (2,) and F (2, 2), of q residuals at the squared distance rᵀ S⁻¹ r."""
+    w, NG = min(1.0, _rare(q) / max(squared, 1.0)), N.dot(G)
+    g = 0.5 * (w * N.dot(u).dot(u) - N.reshape(2, -1).dot(G.ravel()))
+    F = 0.5 * NG.reshape(2, -1).dot(NG.swapaxes(1, 2).reshape(2, -1).T)
+    return g, F
+
+
+def learnt(
+    logs: FloatArray, information: FloatArray, g: FloatArray, F: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return F̄ (2, 2) and θ (2,) after an observation of g and F."""
+    information = (1.0 - 1.0 / MEMORY) * information + F
+    change = np.linalg.solve(information + _PRIOR, g - logs / MEMORY)
+    logs = logs + np.minimum(np.maximum(change, -MAX_STEP), MAX_STEP)
+    return information, np.minimum(np.maximum(logs, LEAST_LOGARITHM), LARGEST_LOGARITHM)
+
+
+def _rare(q: int) -> float:
+    """Return what χ² of q degrees of freedom exceeds once in a hundred times (R. A. Fisher)."""
+    return 0.5 * (math.sqrt(2.0 * q - 1.0) + RARE) ** 2

@@ -1,0 +1,256 @@
+"""Noise of observed points, from the settings or from the messages: covariances (m, 3, 3), m².
+
+And how far the pose of a square tag may be off, as its corners in the image are. With corners that
+err by σ px, a focal length f in px and an edge s, at the range r the mean of the four gives the
+direction, σ/(2 f), and their spread the range, r² σ/(√2 f s). How the tag is turned about its
+normal shows as well as its range; how it is tilted hardly, where it is seen frontally.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.lie import so3
+from slam_observer_ros.lie.matrices import limited
+from slam_observer_ros.settings.estimator_settings import Settings
+
+RESOLUTION_M = 1e-4
+"""Standard deviation that each coordinate of an observed point has at least.
+
+A smaller one is lost in rounding beside a pose that may be off by a kilometre.
+"""
+
+RELATIVE_RESOLUTION = 1e-6
+"""The same as a share of the distance, for points in single precision or better."""
+
+RESOLUTION_RAD = 1e-4
+"""Least standard deviation of an orientation about each axis."""
+
+MAX_ERROR_M = 1e3
+"""Standard deviation of an observed point beyond which a message only says 'unknown'."""
+
+MIN_SHARE, MOST_SHARE_M2 = 1e-6, 1e-6
+"""Least variance of an observed point in any direction, as a share of its total variance.
+
+But no more than (1 mm)², as of a bearing whose depth may be anywhere within a kilometre.
+"""
+
+LASTING = 0.1
+"""For which share of the time that a robot has stood its sensor's error is taken to last."""
+
+MIN_INTERVAL_S = 1e-3
+"""Observations that are less apart count as so far apart: two cameras may see at once."""
+
+_TINY = np.finfo(np.float64).tiny
+_IDENTITY = np.eye(3)
+
+
+class PointFigures(NamedTuple):
+    """How far points may be off: variances along and across the line of sight of length r, m²."""
+
+    along_0: float
+    along_2: float  # times r²
+    along_4: float  # times r⁴
+    across_0: float
+    across_2: float  # times r²
+
+
+class ObservationNoise:
+    """How far observed points may be off, as ``observation_model`` and its figures say.
+
+    Attributes
+    ----------
+    stood_s : float
+        For how long the robot has stood now, 0 while it moves.
+
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self.stood_s = 0.0
+
+    def covariances(
+        self, event: ObservationEvent, lines_of_sight: FloatArray | None = None
+    ) -> FloatArray:
+        """Return what an observation's points may be off by, metres squared.
+
+        All can be inverted, even if a message or a point at the sensor itself says that some
+        direction is known exactly. ``lines_of_sight`` (m, 3) lead from the sensor to where points
+        of unknown covariance should be; default where they were measured.
+        """
+        lines_of_sight = event.lines_of_sight if lines_of_sight is None else lines_of_sight
+        if event.covariances is None:
+            return self.at(lines_of_sight)
+        return stated_covariances(event.points, event.covariances, lines_of_sight, self.figures)
+
+    @property
+    def error_time_s(self) -> float:
+        """Correlation time of the errors, see :func:`repetition_factors`.
+
+        What a robot sees from one place has the same error, as light and view stay as they are.
+        How slowly that changes nobody knows: it is taken to last for a share of the time for which
+        the robot has stood so far, as flicker noise does. Of its views then only the logarithm of
+        their number counts.
+        """
+        return max(self._settings.observation_correlation_time, LASTING * self.stood_s)
+
+    def repetitions(self, dt_s: FloatArray) -> FloatArray:
+        """Return the factors (m,) of points seen before, as :func:`repetition_factors`."""
+        return repetition_factors(dt_s, self.error_time_s)
+
+    def orientation_covariances(self, event: ObservationEvent, Z: FloatArray) -> FloatArray:
+        """Return what an observation's orientations may be off by (m, 3, 3), rad².
+
+        Of rotation vectors along the event's axes; all can be inverted. ``Z`` (m, 3, 3) are the
+        orientations that are expected, or measured where none is.
+        """
+        settings, stated = self._settings, event.orientation_covariances
+        if settings.observation_model == 'fiducial':
+            modelled = orientation_covariances(Z, event.lines_of_sight, settings)
+        else:
+            modelled = np.tile(settings.orientation_noise**2 * _IDENTITY, (len(Z), 1, 1))
+        if stated is not None:
+            is_stated = stated.any(axis=(1, 2))
+            modelled[is_stated] = limited(stated[is_stated], np.full(3, np.pi))
+        return modelled + RESOLUTION_RAD**2 * _IDENTITY
+
+    def at(self, lines_of_sight: FloatArray) -> FloatArray:
+        """Return what the settings say of points along ``lines_of_sight`` (m, 3)."""
+        return point_covariances(lines_of_sight, self.figures)
+
+    @property
+    def figures(self) -> PointFigures:
+        """How far points may be off, as the settings say now."""
+        s = self._settings
+        if s.observation_model == 'cartesian':
+            return PointFigures(s.point_noise**2, 0.0, 0.0, s.point_noise**2, 0.0)
+        if s.observation_model == 'range_bearing':
+            return PointFigures(
+                s.range_noise**2, s.range_scale_noise**2, 0.0, 0.0, s.bearing_noise**2
+            )
+        squared = (s.pixel_noise / s.focal_length) ** 2
+        if s.observation_model == 'stereo':
+            parallax = s.disparity_noise / (s.focal_length * s.stereo_baseline)
+            return PointFigures(0.0, 0.0, parallax**2, 0.0, squared)
+        # The mean of a tag's four corners, and their spread (see above).
+        return PointFigures(0.0, 0.0, 0.5 * squared / s.tag_size**2, 0.0, 0.25 * squared)
+
+
+def stated_covariances(
+    points: FloatArray, stated: FloatArray, lines_of_sight: FloatArray, figures: PointFigures
+) -> FloatArray:
+    """Return covariances (m, 3, 3) of ``points`` as stated, or by the figures where unknown."""
+    # Else far points that are said to be exact are lost beside an uncertain heading.
+    least = RELATIVE_RESOLUTION**2 * np.einsum('ij,ij->i', points, points)
+    covariances = limited(stated, np.full(3, MAX_ERROR_M)) + least[:, None, None] * _IDENTITY
+    covariances = _invertible(covariances)
+    unknown = ~stated.any(axis=(1, 2))
+    if unknown.any():
+        covariances[unknown] = point_covariances(lines_of_sight[unknown], figures)
+    return covariances
+
+
+def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
+    """Return by what factors (m,) the variances of observations grow if their errors last.
+
+    An error with the correlation time t_e is c = e^(−dt/t_e) times what it was ``dt_s`` (m,)
+    before, or infinitely long ago, plus new noise. n observations of one thing then weigh as much
+    as one, and n − 1 whose variance is (1 + c)/(1 − c) times as large: exactly so if they come at
+    a steady rate. With t_e = 0 all errors are new.
+    """
+    if error_time_s == 0.0:
+        return np.ones(len(dt_s))
+    new = -np.expm1(-np.maximum(dt_s, MIN_INTERVAL_S) / error_time_s)  # 1 − c
+    factors: FloatArray = (2.0 - new) / new
+    return factors
+
+
+def _invertible(covariances: FloatArray) -> FloatArray:
+    """Return covariances (m, 3, 3) with no direction known exactly."""
+    shares = MIN_SHARE * covariances.trace(axis1=1, axis2=2)
+    least = RESOLUTION_M**2 + np.minimum(shares, MOST_SHARE_M2)
+    invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
+    return invertible
+
+
+def point_covariances(lines_of_sight: FloatArray, figures: PointFigures) -> FloatArray:
+    """Return covariances (m, 3, 3) of points along ``lines_of_sight`` (m, 3), invertible.
+
+    A point at the sensor itself has no line of sight; it is known as well as its range is.
+    """
+    squared, most = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight), MAX_ERROR_M**2
+    along = figures.along_0 + (figures.along_2 + figures.along_4 * squared) * squared
+    along = np.minimum(along, most)
+    across = np.minimum(figures.across_0 + figures.across_2 * squared, most)
+    if np.count_nonzero(squared) < len(squared):
+        across = np.where(squared > 0.0, across, along)
+    excess = (along - across) / np.maximum(squared, _TINY)
+    scaled = excess[:, None] * lines_of_sight
+    covariances: FloatArray = scaled[:, :, None] * lines_of_sight[:, None, :]
+    # As of _invertible, but with the trace that is known.
+    shares = MIN_SHARE * (along + 2.0 * across)
+    least = RESOLUTION_M**2 + np.minimum(shares, MOST_SHARE_M2)
+    covariances += (across + least)[:, None, None] * _IDENTITY
+    return covariances
+
+
+_CORNERS = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+LEAST_RANGE = 1.0
+"""Range, in edges of the tag, nearer than which no camera has all of it in view."""
+
+LARGEST_RANGE = 1e6
+"""Range, in edges of the tag, beyond which its corners are one point but for rounding."""
+
+LEAST_NOISE = 1e-6
+"""Noise of corners, in focal lengths, beside which less is lost in rounding."""
+
+
+def orientation_covariances(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatArray:
+    """Return the covariances (m, 3, 3) of tags' orientations, rad², of tags turned by ``Z``.
+
+    That of least squares, (Jᵀ J)⁻¹ σ² of the corners' derivatives by the pose, without position.
+    Of tags whose ``Z`` is zero nothing is known.
+    """
+    covariances = np.tile(np.pi**2 * np.eye(3), (len(Z), 1, 1))
+    are_known = Z.any(axis=(1, 2))
+    if are_known.any():
+        covariances[are_known] = _of_known(Z[are_known], lines_of_sight[are_known], s)
+    return covariances
+
+
+def _of_known(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatArray:
+    # The camera looks along the line of sight: its axes U, and the corners q in them.
+    range_m = np.linalg.norm(lines_of_sight, axis=1)
+    range_m = np.clip(range_m, LEAST_RANGE * s.tag_size, LARGEST_RANGE * s.tag_size)
+    U = _looking_along(lines_of_sight)
+    arms = s.tag_size * _CORNERS @ (U @ Z).swapaxes(-1, -2)  # (m, 4, 3)
+    q = arms + range_m[:, None, None] * np.array([0.0, 0.0, 1.0])
+    # f (x, y) / z, by turns and shifts of the tag: dq = dω × arm + dt.
+    projected = np.zeros((*q.shape[:2], 2, 3))
+    projected[..., 0, 0] = projected[..., 1, 1] = 1.0 / q[..., 2]
+    projected[..., 2] = -q[..., :2] / q[..., 2:] ** 2
+    J = np.concatenate([projected @ -so3.hat(arms), projected], axis=-1)
+    J = s.focal_length * J.reshape(len(Z), 8, 6)
+    # What turns are known by once the position is.
+    N = J.swapaxes(-1, -2) @ J
+    turns = N[:, :3, :3] - N[:, :3, 3:] @ np.linalg.solve(N[:, 3:, 3:], N[:, 3:, :3])
+    noise = max(s.pixel_noise, LEAST_NOISE * s.focal_length)
+    information = turns / noise**2 + np.eye(3) / np.pi**2  # nothing is off by more
+    covariances: FloatArray = U.swapaxes(-1, -2) @ np.linalg.inv(information) @ U
+    return covariances
+
+
+def _looking_along(lines_of_sight: FloatArray) -> FloatArray:
+    """Return rotations (m, 3, 3) to axes whose third one is along the line of sight."""
+    third = lines_of_sight / np.maximum(
+        np.linalg.norm(lines_of_sight, axis=1, keepdims=True), _TINY
+    )
+    third[~third.any(axis=1)] = (0.0, 0.0, 1.0)
+    # Across the axis that it is furthest from.
+    first = np.cross(np.eye(3)[np.abs(third).argmin(axis=1)], third)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(third, first), third], axis=1)

@@ -1,0 +1,491 @@
+"""Velocities of the recent past, of one or two sensors, each held until the next one."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, fields
+import math
+from statistics import median_low
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    flatten_velocities,
+    MeasuredVelocity,
+    VelocityBlock,
+    VelocityEvent,
+)
+from slam_observer_ros.models.held_velocities import HeldUntil, HeldVelocities
+
+NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
+"""Stamp of a velocity that timed out before time began, nanoseconds."""
+
+BLOCK, BLOCKS = 64, 16
+"""The last 16 times 64 periods show how long messages of a sensor are in force as a rule.
+
+So many that they have pauses in them where these are usual, as of commands.
+"""
+
+FEWEST_PERIODS = 5
+"""Periods that show how often messages come: a pause or two among them change nothing."""
+
+STANDS_NS = NANOSECONDS_PER_SECOND
+"""How long a velocity must have been exactly zero before the robot stands, nanoseconds.
+
+Commands are ahead of the robot by their delay, and it coasts; both take less than that.
+"""
+
+TURNS = 0.02
+"""Angular velocity beyond which it is not the bias of a gyroscope, rad/s: the robot turns."""
+
+STANDING = 1e-4**2 * np.eye(6)
+"""(6, 6) covariance of the velocity of a robot that stands, rad²/s² and m²/s²: next to none.
+
+In eight hours, with twenty messages a second, it drifts by 4 mm. With much less, what links two
+observations would weigh so much that smoothing had no digits left for what is seen.
+"""
+
+FIRST_CAPACITY = 64
+"""Velocities that there is room for at first."""
+
+
+class Velocities(NamedTuple):
+    """Velocities of one or two sensors, each in force from its stamp to the next.
+
+    Columns of two are of the angular and the linear part.
+    """
+
+    stamps_ns: IntArray  # (r,)
+    body_velocities: FloatArray  # (r, 6)
+    since_ns: IntArray  # (r, 2) stamps of the messages that they are of
+    is_stated: BoolArray  # (r, 2) whether a message stated its covariance
+    covariances: FloatArray  # (r, 6, 6) as stated, zero where unknown
+    usual_angular_s: float  # how long one is held as a rule
+    usual_linear_s: float
+    timeout_ns: int  # how long one is held at most
+
+
+class VelocityHistory:
+    """Velocities in stamp order, joined with the angular velocities of another sensor.
+
+    A velocity is held for ``timeout_ns`` at most. Where the other sensor's angular one was older
+    when it came, the velocity's own angular part counts. With ``is_planar`` only parts in the
+    plane z = 0 count.
+    """
+
+    def __init__(self, timeout_ns: int, is_planar: bool = False) -> None:
+        self._timeout_ns = timeout_ns
+        self._is_planar = is_planar
+        # In force from each stamp to the next; the first one is in force before any event.
+        self._joined, self._count = _Joined.with_room_for(FIRST_CAPACITY), 1
+        self._angular: AngularVelocityEvent | None = None
+        self._periods, self._angular_periods = _Periods(), _Periods()
+        self._zero_since_ns: int | None = None  # since when the velocity has been exactly zero
+        self._last_zero_ns = NEVER_NS
+        # Who has no odometry may publish zeros, and state how the robot may move as their noise.
+        self._has_moved = False
+        self._stands = False
+
+    def append(self, measured: MeasuredVelocity) -> bool:
+        """Add velocities that are not earlier than any other; return whether they are in force.
+
+        An angular velocity waits for the first linear one.
+        """
+        stand: list[int] = []  # which of the new ones are of a robot that stands
+        if isinstance(measured, AngularVelocityEvent):
+            self._angular_periods.add(measured.stamp_ns)
+            self._angular = measured
+            if self._count == 1:
+                return False
+            first = self._new_row(1)
+            self._joined.repeat_last(first, measured.stamp_ns)
+            self._joined.usual_s[first, 1] = self._periods.usual_s
+            stand = [first] * self._stands
+        elif isinstance(measured, VelocityEvent):
+            first, one, usual_s = self._new_row(1), measured, self._took(measured)
+            self._joined.write(first, one.stamp_ns, one.body_velocity, one.covariance, usual_s)
+            if any(one.body_velocity.tolist()):
+                self._zero_since_ns, self._stands, self._has_moved = None, False, True
+            else:
+                stand = [first] * self._note_zero(one.stamp_ns)
+        else:
+            first, many, usual_s = self._new_row(len(measured)), measured, self._took(measured)
+            rows = slice(first, self._count)
+            self._joined.write(
+                rows, many.stamps_ns, many.body_velocities, many.covariances, usual_s
+            )
+            move = np.asarray(many.body_velocities.any(axis=1)).tolist()
+            for row, stamp_ns in enumerate(many.stamps_ns.tolist(), first):
+                if move[row - first]:
+                    self._zero_since_ns, self._stands, self._has_moved = None, False, True
+                elif self._note_zero(stamp_ns):
+                    stand.append(row)
+        if (angular := self._angular) is not None:
+            self._joined.usual_s[first : self._count, 0] = self._angular_periods.usual_s
+            stamps_ns = self._joined.stamps_ns[first : self._count]
+            begin = stamps_ns.searchsorted(angular.stamp_ns)
+            end = stamps_ns.searchsorted(angular.stamp_ns + self._timeout_ns, 'right')
+            self._joined.write_angular(slice(first + begin, first + end), angular)
+        if stand:
+            self._let_stand(np.array(stand))
+        return True
+
+    @property
+    def median_period_s(self) -> float:
+        """Median time between two velocities of late, seconds; 0 while that is not known.
+
+        Means over the time since the last one count as any number of them.
+        """
+        return self._periods.median_s
+
+    def _note_zero(self, stamp_ns: int) -> bool:
+        """Note a velocity that is exactly zero; return whether the robot stands by then."""
+        since_ns = self._zero_since_ns
+        if since_ns is None or stamp_ns > self._last_zero_ns + self._timeout_ns:
+            self._zero_since_ns = since_ns = stamp_ns
+        self._last_zero_ns = stamp_ns
+        self._stands = self._has_moved and stamp_ns >= since_ns + STANDS_NS
+        return self._stands
+
+    def _let_stand(self, rows: IntArray) -> None:
+        """Let velocities (k,) be zero, and be known to be, unless a gyroscope says otherwise."""
+        joined = self._joined
+        turn = np.linalg.norm(joined.body_velocities[rows, :3], axis=1) > TURNS
+        if np.count_nonzero(turn):
+            self.doubt_standing()
+            rows = rows[~turn]
+        joined.body_velocities[rows], joined.covariances[rows] = 0.0, STANDING
+        joined.is_stated[rows] = True
+
+    def doubt_standing(self) -> None:
+        """Begin again to judge whether the robot stands: something else contradicts it."""
+        self._zero_since_ns, self._stands = None, False
+
+    def stood_s(self, stamp_ns: int) -> float:
+        """Return for how long the robot has stood at a stamp, seconds; 0 while it moves."""
+        if not self._stands or self._zero_since_ns is None:
+            return 0.0
+        return to_s(max(stamp_ns - self._zero_since_ns, 0))
+
+    def _new_row(self, k: int) -> int:
+        """Make room for so many more; return the first."""
+        first, self._count = self._count, self._count + k
+        if self._count > len(self._joined.stamps_ns):
+            self._joined = self._joined.copied(slice(first), 2 * self._count)
+        return first
+
+    def _took(self, velocities: VelocityEvent | VelocityBlock) -> FloatArray | float:
+        """Return for how long each was in force as a rule when it came, seconds."""
+        if velocities.is_mean:  # their errors do not go on, however long they are held
+            return self._periods.usual_s
+        if isinstance(velocities, VelocityEvent):
+            return self._periods.add(velocities.stamp_ns)
+        return np.array(
+            [self._periods.add(stamp_ns) for stamp_ns in velocities.stamps_ns.tolist()]
+        )
+
+    def _row(self, stamp_ns: int, side: Literal['left', 'right'] = 'right') -> int:
+        """Return the first row behind a stamp, or with ``'left'`` the first at it or behind."""
+        return int(self._joined.stamps_ns[: self._count].searchsorted(stamp_ns, side))
+
+    def latest(self, stamp_ns: int) -> FloatArray | None:
+        """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
+        row, joined = self._row(stamp_ns) - 1, self._joined
+        if stamp_ns - joined.since_ns[row, 1] > self._timeout_ns:
+            return None
+        return self._counting(joined.body_velocities[row])
+
+    def in_force(self, stamp_ns: int) -> HeldVelocities | None:
+        """Return the velocity in force at ``stamp_ns``, held for as long as messages usually are.
+
+        It is in the gap between messages if it has timed out; None if no two are known yet.
+        """
+        row, joined = self._row(stamp_ns) - 1, self._joined
+        period_s = self._periods.usual_s
+        if math.isinf(period_s):  # of means over time, which have none
+            period_s = to_s(int(joined.stamps_ns[row] - joined.stamps_ns[row - 1]))
+        if row < 2 or period_s <= 0.0:
+            return None
+        one = slice(row, row + 1)
+        timed_out = stamp_ns - joined.since_ns[row, 1] > self._timeout_ns
+        return HeldVelocities(
+            body_velocities=self._counting(joined.body_velocities[one]),
+            covariances=joined.covariances[one],
+            is_stated=joined.is_stated[one],
+            dt_s=np.array([0.0 if timed_out else period_s]),
+            gap_s=np.array([period_s if timed_out else 0.0]),
+            before_s=np.zeros((1, 2)),
+            usual_s=np.array(self._usual_s()),
+        )
+
+    def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
+        """Return the velocities in force from ``start_ns`` to ``end_ns``."""
+        held = self._held(self._pieces(start_ns, end_ns))
+        return held.with_gaps_apart() if np.count_nonzero(held.gap_s) else held
+
+    def held_until(self, start_ns: int, stamps_ns: IntArray, delay_ns: int) -> HeldUntil:
+        """Return what led from ``start_ns`` to increasing stamps (s,), ``delay_ns`` before each.
+
+        As :meth:`held` would have it, had it been asked at each stamp, which is one of a velocity.
+        """
+        start_ns, ends_ns = start_ns - delay_ns, stamps_ns - delay_ns
+        stamps, first, known = self._known_at(stamps_ns, start_ns)
+        # Of what was known then, the velocity that each instant is in; others before are whole.
+        counts: IntArray = np.minimum(stamps.searchsorted(ends_ns) - 1, known)
+        begins, k = np.maximum(stamps, start_ns), counts[-1]
+        return HeldUntil(
+            whole=self._held(self._cut(slice(first, first + k), begins[:k], begins[1 : k + 1])),
+            last=self._held(self._cut(first + counts, begins[counts], ends_ns)),
+            counts=counts,
+            usual_s=self._joined.usual_s[first + known],
+        )
+
+    def means_until(self, centres_ns: IntArray, reach_ns: int, stamps_ns: IntArray) -> FloatArray:
+        """Return :meth:`mean` around centres (s,), had it been asked at increasing stamps (s,)."""
+        starts_ns, ends_ns = centres_ns - reach_ns, centres_ns + reach_ns
+        stamps, first, known = self._known_at(stamps_ns, int(starts_ns.min()))
+        joined = self._joined
+        velocities = self._counting(joined.body_velocities[first : first + len(stamps)])
+        stops = joined.since_ns[first : first + len(stamps), 1] + self._timeout_ns
+        # How long a velocity was known, and how far it led, until each of their stamps, …
+        known_s = to_s(np.maximum(np.minimum(stops[:-1], stamps[1:]) - stamps[:-1], 0))
+        until = np.zeros((len(stamps), 7))
+        pieces = np.column_stack([known_s[:, None] * velocities[:-1], known_s])
+        np.cumsum(pieces, axis=0, out=until[1:])
+        # … and until any time, with the last one before it held until then.
+        sums = np.zeros((2, len(stamps_ns), 7))
+        for of_each, times in zip(sums, (starts_ns, ends_ns), strict=True):
+            rows = np.minimum(stamps.searchsorted(times, 'right') - 1, known)
+            since_s = to_s(np.maximum(np.minimum(stops[rows], times) - stamps[rows], 0))
+            of_each[:] = until[rows]
+            of_each[:, :6] += since_s[:, None] * velocities[rows]
+            of_each[:, 6] += since_s
+        motions, lengths_s = np.split(sums[1] - sums[0], [6], axis=1)
+        means: FloatArray = motions / np.where(lengths_s > 0.0, lengths_s, np.inf)
+        return means
+
+    def between(self, start_ns: int, end_ns: int) -> tuple[IntArray, FloatArray]:
+        """Return stamps and measured velocities (m, 6) of those in force between two stamps."""
+        rows = slice(max(self._row(start_ns) - 1, 1), self._row(end_ns))
+        return self._joined.stamps_ns[rows], self._joined.body_velocities[rows]
+
+    def _known_at(self, stamps_ns: IntArray, start_ns: int) -> tuple[IntArray, int, IntArray]:
+        """Return stamps of velocities, the row of the first, and which was the latest at each.
+
+        From the one in force at ``start_ns`` on, or known at the first of ``stamps_ns`` (s,).
+        """
+        earliest_ns, latest_ns = min(start_ns, int(stamps_ns[0])), int(stamps_ns[-1])
+        first = self._row(earliest_ns) - 1
+        stamps = self._joined.stamps_ns[first : self._row(latest_ns)]
+        return stamps, first, stamps.searchsorted(stamps_ns, 'right') - 1
+
+    def flat(self) -> Velocities:
+        """Return all that are known as plain arrays."""
+        return self._flat(self._count, *self._usual_s())
+
+    def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
+        """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
+        counts = self.flat().stamps_ns.searchsorted(stamps_ns, 'right')
+        usual_s = self._joined.usual_s[counts - 1].tolist()
+        return [
+            self._flat(count, *each) for count, each in zip(counts.tolist(), usual_s, strict=True)
+        ]
+
+    def _flat(self, count: int, usual_angular_s: float, usual_linear_s: float) -> Velocities:
+        """Return the first so many."""
+        joined = self._joined
+        return Velocities(
+            joined.stamps_ns[:count],
+            joined.body_velocities[:count],
+            joined.since_ns[:count],
+            joined.is_stated[:count],
+            joined.covariances[:count],
+            usual_angular_s,
+            usual_linear_s,
+            self._timeout_ns,
+        )
+
+    def mean(self, start_ns: int, end_ns: int) -> FloatArray:
+        """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
+        pieces = self._pieces(start_ns, end_ns)
+        held_ns = (pieces.stops_ns - pieces.begins_ns).astype(np.float64)
+        known_ns = held_ns.sum()
+        if known_ns == 0.0:
+            return np.zeros(6)
+        return self._counting(held_ns.dot(self._joined.body_velocities[pieces.rows]) / known_ns)
+
+    @property
+    def begins_ns(self) -> int | None:
+        """Stamp since which velocities are known, nanoseconds; None while there are none."""
+        return int(self._joined.stamps_ns[1]) if self._count > 1 else None
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop velocities that were no longer in force at ``stamp_ns``."""
+        first, count = self._row(stamp_ns) - 1, self._count
+        if first > count // 2:
+            kept = np.append(0, np.arange(first, count))
+            self._joined = self._joined.copied(kept, len(self._joined.stamps_ns))
+            self._count = len(kept)
+
+    def _held(self, pieces: _Pieces) -> HeldVelocities:
+        rows, begins_ns, stops_ns, ends_ns = pieces
+        joined = self._joined
+        before_ns = begins_ns[:, None] - joined.since_ns[rows]
+        dt_s, gap_s, *before_s = to_s(
+            np.array([stops_ns - begins_ns, ends_ns - stops_ns, *before_ns.T])
+        )
+        return HeldVelocities(
+            body_velocities=self._counting(joined.body_velocities[rows]),
+            covariances=joined.covariances[rows],
+            is_stated=joined.is_stated[rows],
+            dt_s=dt_s,
+            gap_s=gap_s,
+            before_s=np.array(before_s).T,
+            usual_s=np.array(self._usual_s()),
+        )
+
+    def _pieces(self, start_ns: int, end_ns: int) -> _Pieces:
+        first, last = self._row(start_ns) - 1, self._row(end_ns, 'left')
+        stamps: IntArray = np.append(self._joined.stamps_ns[first:last], end_ns)
+        return self._cut(slice(first, last), np.maximum(stamps[:-1], start_ns), stamps[1:])
+
+    def _cut(self, rows: slice | IntArray, begins: IntArray, ends: IntArray) -> _Pieces:
+        timed_out = self._joined.since_ns[rows, 1] + self._timeout_ns
+        return _Pieces(rows, begins, np.minimum(np.maximum(timed_out, begins), ends), ends)
+
+    def _usual_s(self) -> tuple[float, float]:
+        linear_s = self._periods.usual_s
+        angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
+        return angular_s, linear_s
+
+    def _counting(self, body_velocities: FloatArray) -> FloatArray:
+        """Return what counts of velocities (…, 6), as a copy: for all of a step at once."""
+        if self._is_planar:
+            return flatten_velocities(body_velocities)
+        return np.array(body_velocities)
+
+
+class _Periods:
+    """For how long messages of one sensor are in force as a rule.
+
+    ``usual_s`` is the longest period lately but one, seconds; infinite before there are two.
+    """
+
+    def __init__(self) -> None:
+        self._block_ns: list[int] = []
+        # The two longest of each block before: no others are among the two longest of all.
+        self._longest_ns: deque[int] = deque(maxlen=2 * BLOCKS)
+        self._last_ns: int | None = None
+        self._usual_ns = -1  # what a period must be longer than to change it
+        self.usual_s = math.inf
+        self._recent_ns: deque[int] = deque(maxlen=BLOCK)
+
+    def add(self, stamp_ns: int) -> float:
+        """Take the stamp of the next message; return ``usual_s``."""
+        last_ns, self._last_ns = self._last_ns, stamp_ns
+        if last_ns is None:
+            return self.usual_s
+        period_ns = stamp_ns - last_ns
+        self._block_ns.append(period_ns)
+        self._recent_ns.append(period_ns)
+        is_full = len(self._block_ns) == BLOCK
+        if is_full:
+            self._longest_ns.extend(sorted(self._block_ns)[-2:])
+            self._block_ns = []
+        if is_full or period_ns > self._usual_ns:
+            self._judge()
+        return self.usual_s
+
+    @property
+    def median_s(self) -> float:
+        """Half of the periods of late are longer, seconds; 0 while there are few."""
+        few = len(self._recent_ns) < FEWEST_PERIODS
+        return 0.0 if few else to_s(int(median_low(self._recent_ns)))
+
+    def _judge(self) -> None:
+        longest_ns = sorted([*self._longest_ns, *self._block_ns])[-2:]
+        if len(longest_ns) == 2:
+            self._usual_ns = longest_ns[0]
+            self.usual_s = to_s(longest_ns[0]) or math.inf
+
+
+class _Pieces(NamedTuple):
+    """Rows of velocities in force, and when each begins, times out and ends."""
+
+    rows: slice | IntArray
+    begins_ns: IntArray
+    stops_ns: IntArray
+    ends_ns: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Joined:
+    """Velocities in force from one event to the next, each of one message or two.
+
+    Columns of two: angular and linear part, with the stamp of the message that each is of.
+    """
+
+    stamps_ns: IntArray  # (c,) from when on each is in force
+    body_velocities: FloatArray  # (c, 6)
+    covariances: FloatArray  # (c, 6, 6), zero where unknown
+    is_stated: BoolArray  # (c, 2)
+    since_ns: IntArray  # (c, 2)
+    usual_s: FloatArray  # (c, 2) how long it was usual then that they are in force
+
+    @classmethod
+    def with_room_for(cls, capacity: int) -> _Joined:
+        """Return unknown velocities."""
+        return cls(
+            np.full(capacity, NEVER_NS, dtype=np.int64),
+            np.zeros((capacity, 6)),
+            np.zeros((capacity, 6, 6)),
+            np.zeros((capacity, 2), dtype=np.bool_),
+            np.full((capacity, 2), NEVER_NS, dtype=np.int64),
+            np.full((capacity, 2), np.inf),
+        )
+
+    def copied(self, rows: slice | IntArray, capacity: int) -> _Joined:
+        """Return some of the velocities, with room for ``capacity`` of them."""
+        roomy = _Joined.with_room_for(capacity)
+        for field in fields(_Joined):
+            kept = getattr(self, field.name)[rows]
+            getattr(roomy, field.name)[: len(kept)] = kept
+        return roomy
+
+    def write(
+        self,
+        rows: slice | int,
+        stamps_ns: IntArray | int,
+        body_velocities: FloatArray,
+        covariances: FloatArray | None,
+        usual_s: FloatArray | float,
+    ) -> None:
+        """Fill in one row or several, once: others may see them."""
+        self.stamps_ns[rows] = stamps_ns
+        self.body_velocities[rows] = body_velocities
+        # Entry by entry, which of one row takes a quarter of the time.
+        self.since_ns[rows, 0] = self.since_ns[rows, 1] = stamps_ns
+        self.usual_s[rows, 0] = self.usual_s[rows, 1] = usual_s
+        if covariances is not None:
+            self.covariances[rows] = covariances
+            self.is_stated[rows, 0] = covariances[..., :3, :3].any(axis=(-2, -1))
+            self.is_stated[rows, 1] = covariances[..., 3:, 3:].any(axis=(-2, -1))
+
+    def repeat_last(self, row: int, stamp_ns: int) -> None:
+        """Let the velocity before a row be in force from another stamp on, too."""
+        for array in (self.body_velocities, self.covariances, self.is_stated, self.since_ns):
+            array[row] = array[row - 1]
+        self.stamps_ns[row] = stamp_ns
+
+    def write_angular(self, rows: slice, angular: AngularVelocityEvent) -> None:
+        """Put the other sensor's angular velocity in place of the velocities' own."""
+        is_stated = angular.covariance is not None and bool(angular.covariance.any())
+        self.body_velocities[rows, :3] = angular.angular_velocity
+        self.covariances[rows, :3] = self.covariances[rows, :, :3] = 0.0
+        self.covariances[rows, :3, :3] = angular.covariance if is_stated else 0.0
+        self.is_stated[rows, 0] = is_stated
+        self.since_ns[rows, 0] = angular.stamp_ns

@@ -1,1 +1,0 @@
-"""Recordings and public data sets, read and written without a ROS installation."""

@@ -1,0 +1,338 @@
+"""Choice of the topics that a replay needs, by message type first and by name where two fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+import logging
+from os.path import commonpath
+
+from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.common.findings import found
+from slam_observer_ros.messages.clouds import CLOUDS
+from slam_observer_ros.messages.detections import CAMERA_INFO, IN_IMAGES
+from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
+from slam_observer_ros.recordings.sources import last_part, Topic
+from slam_observer_ros.settings.input_settings import (
+    AUTO,
+    InputSettings,
+    message_types,
+    ON_TF,
+    POSE_DIFFERENCES,
+)
+
+TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
+"""Topics with one of these between the slashes of their name hold truth, not measurements."""
+
+ESTIMATE_NAMES = frozenset({'landmark_map', 'landmark_estimates', 'map'})
+"""Landmarks that an observer publishes, and does not measure; ``map`` in older recordings."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TopicNames:
+    """Names that the user gives, with or without leading slash; None for topics to be found."""
+
+    velocity: str | None = None
+    landmarks: str | None = None
+    pose_truth: str | None = None
+    landmark_truth: str | None = None
+    imu: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TransformTopics:
+    """/tf_static and /tf, or a namespace's: each one topic, or none."""
+
+    static: tuple[Topic, ...]
+    moving: tuple[Topic, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SelectedTopics:
+    """The topics of a replay: of measurements, of the truth, and of what places the sensors.
+
+    Truth that is not recorded is None, and so is ``imu``, unless the angular velocity is its.
+    """
+
+    velocity: Topic
+    landmarks: Topic
+    pose_truth: Topic | None
+    landmark_truth: Topic | None
+    transforms: TransformTopics
+    imu: Topic | None = None
+    cameras: tuple[Topic, ...] = ()
+    """CameraInfo, where landmarks are pixels or may be."""
+
+    @property
+    def inputs(self) -> tuple[Topic, ...]:
+        """What the estimator takes in."""
+        imu = () if self.imu is None else (self.imu,)
+        return (self.velocity, self.landmarks, *imu)
+
+
+@dataclass(frozen=True, slots=True)
+class _Role:
+    """What a topic is wanted for: its option, its types, and which name is preferred."""
+
+    name: str
+    option: str
+    message_types: Collection[str]
+    is_truth: bool
+    rank: Callable[[str], int]
+    types_by_name: Collection[str] = ()
+    """Types that hold other things, too: taken only of a topic that the user names."""
+    is_typed: bool = False
+    """Whether the user names the type: clouds without ids are taken where there are no others."""
+
+    @property
+    def all_types(self) -> tuple[str, ...]:
+        """All types that a topic may have which the user names."""
+        return (*self.message_types, *self.types_by_name)
+
+
+def select_topics(
+    topics: Sequence[Topic],
+    names: TopicNames,
+    inputs: InputSettings,
+    has_ids: Callable[[Topic], bool],
+    pose_frame: Callable[[Topic], str],
+) -> SelectedTopics:
+    """Pick one topic for each purpose.
+
+    Raises a RecordingError if none fits or two do: it lists them, and the option that decides.
+
+    Parameters
+    ----------
+    topics, names, inputs
+        All topics of a recording, the topics that the user chose, and what of them is used.
+    has_ids : callable
+        Whether the points of a cloud have ids. Clouds without them, such as a lidar's, are taken
+        only if they are chosen by name or by their type, or are called ``landmarks``.
+    pose_frame : callable
+        The frame of an odometry's poses. Where it is the map's, the velocity is an estimate,
+        as an observer's own, and taken only if there is no other.
+
+    """
+    used = [topic for topic in topics if topic.count > 0]
+    choice = _Choice(topics, used, inputs.map_frame, has_ids, pose_frame)
+    velocity = choice.require(_of_velocities(inputs.velocity_source), names.velocity)
+    landmarks = choice.require(*_of_landmarks(names.landmarks, inputs.landmarks_type))
+    selected = SelectedTopics(
+        velocity,
+        landmarks,
+        choice.pick(_of_true_poses(), names.pose_truth),
+        choice.pick(_LANDMARK_TRUTH, names.landmark_truth),
+        transform_topics(topics, (velocity, landmarks)),
+        choice.require(_of_imus(), names.imu) if inputs.use_imu else None,
+        tuple(topic for topic in used if topic.message_type == CAMERA_INFO)
+        if landmarks.message_type in IN_IMAGES
+        else (),
+    )
+    if selected.pose_truth is None:
+        _warn_of_unread_truth(used)
+    return selected
+
+
+def pose_topic(topics: Sequence[Topic], name: str | None) -> Topic:
+    """Return the topic of that name, which has poses, or else the true poses' topic.
+
+    Raises a RecordingError that lists the topics if there is none, or several could be meant.
+    """
+    role = replace(_of_true_poses(), option='--topic')
+    if name is not None:
+        return _named(topics, role, name)
+    used = [topic for topic in topics if topic.count > 0]
+    fitting = [t for t in used if _is_truth(t.name) and t.message_type in role.message_types]
+    return _required(_best(fitting, role), role, used)
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """The topics of a recording, which have messages, and what to choose them by."""
+
+    topics: Sequence[Topic]
+    used: Sequence[Topic]
+    map_frame: str
+    has_ids: Callable[[Topic], bool]
+    pose_frame: Callable[[Topic], str]
+
+    def require(self, role: _Role, name: str | None) -> Topic:
+        return _required(self.pick(role, name), role, self.used)
+
+    def pick(self, role: _Role, name: str | None) -> Topic | None:
+        if name is not None:
+            return _named(self.topics, role, name)
+        right = [topic for topic in self.used if _is_truth(topic.name) == role.is_truth]
+        fitting = [topic for topic in right if self._fits(topic, role)]
+        if len(fitting) > 1 and not role.is_truth:
+            fitting = [topic for topic in fitting if not self._is_estimate(topic)] or fitting
+        found = _best(fitting, role)
+        if found is None and role.is_typed:
+            return _best([t for t in right if t.message_type in role.message_types], role)
+        return found
+
+    def _fits(self, topic: Topic, role: _Role) -> bool:
+        if not role.is_truth and last_part(topic.name) == 'landmarks':
+            return topic.message_type in role.all_types
+        if topic.message_type not in role.message_types:
+            return False
+        return topic.message_type not in CLOUDS or self.has_ids(topic)
+
+    def _is_estimate(self, topic: Topic) -> bool:
+        return topic.message_type == ODOMETRY and self.pose_frame(topic) == self.map_frame
+
+
+def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> TransformTopics:
+    """Pick the /tf and the /tf_static of the robot whose measurements are replayed.
+
+    Robots in namespaces may each have their own, with the same names of frames. Those of the
+    namespace that the inputs share come first, then those further out, /tf at last. Where none
+    of these is recorded, another namespace's are taken if there is only one.
+    """
+    trees = [
+        topic
+        for topic in topics
+        if topic.message_type == TRANSFORMS
+        and topic.count
+        and last_part(topic.name) in ('tf', 'tf_static')
+    ]
+    shared = commonpath([_namespace(topic) for topic in inputs])
+    fitting = [tree for tree in trees if _encloses(_namespace(tree), shared)]
+    if not fitting and len({_namespace(tree) for tree in trees}) == 1:
+        fitting = trees
+    if trees and not fitting:
+        topics_of_trees = ', '.join(tree.name for tree in trees)
+        shared_by = ' and '.join(topic.name for topic in inputs)
+        finding = found('several_robots', topics=topics_of_trees, inputs=shared_by)
+        logger.warning('%s', finding)
+    innermost_last = sorted(fitting, key=lambda tree: len(_namespace(tree)))
+    chosen = {last_part(tree.name): (tree,) for tree in innermost_last}
+    return TransformTopics(chosen.get('tf_static', ()), chosen.get('tf', ()))
+
+
+def _encloses(outer: str, inner: str) -> bool:
+    return commonpath([outer, inner]) == outer
+
+
+def _namespace(topic: Topic) -> str:
+    return '/' + topic.name.strip('/').rpartition('/')[0]
+
+
+def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:
+    """Say why what looks like true poses is passed over."""
+    poses = message_types('pose')
+    unread = [
+        topic
+        for topic in topics
+        if _is_truth(topic.name) and topic.message_type not in (*poses, *CLOUDS)
+    ]
+    if unread:
+        finding = found('unread_truth', types=_join(poses), topics=_join(unread))
+        logger.warning('%s', finding)
+
+
+def _velocity_rank(name: str) -> int:
+    """Prefer ``twist``; put commands behind measurements."""
+    if last_part(name) == 'twist':
+        return 0
+    return 2 if 'cmd' in name or 'command' in name else 1
+
+
+def _landmark_rank(name: str) -> int:
+    """Prefer ``landmarks``; put an observer's own estimates last."""
+    if last_part(name) == 'landmarks':
+        return 0
+    return 2 if last_part(name) in ESTIMATE_NAMES else 1
+
+
+def _pose_rank(name: str) -> int:
+    return 0 if last_part(name) == 'pose' else 1
+
+
+def _of_velocities(source: str) -> _Role:
+    if source == POSE_DIFFERENCES:
+        return _Role('odometry', '--velocity-topic', (ODOMETRY,), False, _velocity_rank)
+    types = tuple(message_types('velocity'))
+    return _Role('velocity', '--velocity-topic', types, False, _velocity_rank)
+
+
+def _of_landmarks(name: str | None, landmarks_type: str) -> tuple[_Role, str | None]:
+    """Return which types landmarks may have, and the name of their topic if it is known."""
+    types = message_types('landmarks').values()
+    wanted = tuple(known.name for known in types if not known.is_ambiguous)
+    by_name = (*(known.name for known in types if known.is_ambiguous), TRANSFORMS)
+    if landmarks_type == ON_TF:
+        wanted, name = (TRANSFORMS,), name or '/tf'
+    elif landmarks_type != AUTO:
+        wanted = tuple(known.name for known in types if known.short_name == landmarks_type)
+    is_typed = landmarks_type != AUTO
+    by_name = () if is_typed else by_name
+    role = _Role('landmark', '--landmarks-topic', wanted, False, _landmark_rank, by_name, is_typed)
+    return role, name
+
+
+def _of_true_poses() -> _Role:
+    return _Role('true pose', '--pose-truth-topic', tuple(message_types('pose')), True, _pose_rank)
+
+
+_LANDMARK_TRUTH = _Role('true landmark', '--landmark-truth-topic', CLOUDS, True, _landmark_rank)
+
+
+def _of_imus() -> _Role:
+    return _Role('Imu', '--imu', tuple(message_types('angular velocity')), False, lambda _name: 0)
+
+
+def _is_truth(name: str) -> bool:
+    return not TRUTH_NAMES.isdisjoint(name.lower().split('/'))
+
+
+def _named(topics: Sequence[Topic], role: _Role, name: str) -> Topic:
+    same_name = [topic for topic in topics if topic.name.strip('/') == name.strip('/')]
+    fitting = [topic for topic in same_name if topic.message_type in role.all_types]
+    if fitting:
+        return fitting[0]
+    if same_name:
+        raise RecordingError(
+            f'{same_name[0]} can not be the {role.name} topic, '
+            f'which is one of {_join(role.all_types)}'
+        )
+    raise RecordingError(f'no topic {name}; the recording holds {_join(topics)}')
+
+
+def _best(fitting: Sequence[Topic], role: _Role) -> Topic | None:
+    if not fitting:
+        return None
+    first = min(role.rank(topic.name) for topic in fitting)
+    best = [topic for topic in fitting if role.rank(topic.name) == first]
+    if len(best) > 1:
+        raise RecordingError(
+            f'{len(best)} topics could be the {role.name} topic: {_join(best)}; '
+            f'choose one with {role.option}'
+        )
+    return best[0]
+
+
+def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topic:
+    if topic is not None:
+        return topic
+    with_ids = ' with ids' if any(name in CLOUDS for name in role.message_types) else ''
+    possible = [
+        topic.name
+        for topic in topics
+        if topic.message_type in role.all_types
+        and _is_truth(topic.name) == role.is_truth
+        and last_part(topic.name) != 'tf_static'
+    ]
+    # Nearly every recording has /tf, most of them without landmarks.
+    possible.sort(key=lambda name: last_part(name) == 'tf')
+    advice = f'may name {_join(possible)}' if possible else 'names another'
+    raise RecordingError(
+        f'no {role.name} topic: none of type {_join(role.message_types)}{with_ids}; '
+        f'{role.option} {advice}; the recording holds {_join(topics)}'
+    )
+
+
+def _join(items: Iterable[object]) -> str:
+    return ', '.join(map(str, items)) or 'nothing'

@@ -1,0 +1,287 @@
+"""Accuracy of an estimated trajectory and map against the truth.
+
+The configuration error belongs to the paper's quotient: the map as the robot sees it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import transpose
+from slam_observer_ros.lie.se3 import rigid_alignment
+from slam_observer_ros.recordings.trajectory import (
+    associate,
+    is_sparse,
+    LandmarkTruth,
+    MAX_GAP_NS,
+    Trajectory,
+)
+
+MIN_POSES = 3
+"""Fewer positions can be aligned without an error left."""
+
+
+def root_mean_square(errors: FloatArray) -> float:
+    """Return the root of the mean squared length of errors (k, d), or of values (k,); k > 0."""
+    return float(np.sqrt(np.sum(errors**2) / len(errors)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrajectoryErrors:
+    """Errors of a trajectory after one rigid alignment of its positions.
+
+    ``estimate`` are the k poses that the truth covers, moved into the truth's world by
+    ``alignment`` (4, 4), and ``truth`` those at the same stamps; ``covered`` says which poses of
+    the whole estimate these are. ``errors`` are :func:`pose_errors` (k, 6) in the truth's axes.
+    """
+
+    estimate: Trajectory
+    truth: Trajectory
+    covered: BoolArray
+    alignment: FloatArray
+    errors: FloatArray
+
+    @property
+    def covered_share(self) -> float:
+        """Share of the estimate that the truth covers; of a sparse one, from its first pose on."""
+        if not is_sparse(self.truth):
+            return float(self.covered.mean())
+        first, last = np.flatnonzero(self.covered)[[0, -1]].tolist()
+        return float((last - first + 1) / len(self.covered))
+
+    @property
+    def ate_rmse_m(self) -> float:
+        """Absolute trajectory error: RMSE of the position, metres."""
+        return root_mean_square(self.errors[:, 3:])
+
+    @property
+    def distances_m(self) -> FloatArray:
+        """(k,) distances from the truth, metres."""
+        return np.asarray(np.linalg.norm(self.errors[:, 3:], axis=1))
+
+    @property
+    def unaligned_rmse_m(self) -> float:
+        """The same without the alignment, for an estimate in the truth's frame, metres."""
+        return root_mean_square(self.in_estimate(self.estimate.positions) - self.truth.positions)
+
+    @property
+    def aligned_truth(self) -> Trajectory:
+        """The true poses in the world of the estimate before the alignment."""
+        return self.truth.moved(se3.inverse(self.alignment))
+
+    def in_estimate(self, points: FloatArray) -> FloatArray:
+        """Return points (n, 3) of the truth's world in the estimate's world, metres."""
+        return se3.transform(se3.inverse(self.alignment), points)
+
+    @property
+    def rotation_rmse_rad(self) -> float:
+        """RMSE of the angle between estimated and true attitude, radians."""
+        return root_mean_square(self.errors[:, :3])
+
+    @property
+    def heading_rmse_rad(self) -> float:
+        """RMSE of the rotation about the world's vertical axis, radians."""
+        return root_mean_square(self.errors[:, 2])
+
+
+def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
+    """Compare a trajectory with the truth after one rigid alignment of all positions.
+
+    Raises an EvaluationError if the truth covers fewer than three poses: these fit in any case.
+    """
+    paired, true_paired, covered = associate(estimate, truth)
+    if len(paired) < MIN_POSES:
+        raise EvaluationError(
+            f'{len(paired)} of its {len(estimate)} poses are at times that the truth covers, '
+            f'where one of the two has poses no more than {to_s(MAX_GAP_NS)} s apart; '
+            f'it takes {MIN_POSES}'
+        )
+    alignment = rigid_alignment(paired.positions, true_paired.positions)
+    aligned = paired.moved(alignment)
+    errors = pose_errors(aligned.poses, true_paired.poses)
+    return TrajectoryErrors(aligned, true_paired, covered, alignment, errors)
+
+
+def pose_errors(poses: FloatArray, true_poses: FloatArray) -> FloatArray:
+    """Return errors (..., 6) in the order and axes of the estimator's pose covariance.
+
+    The rotation vector log(R̂ Rᵀ), rad, then x̂ − x, m, both in the axes of the one world in which
+    the poses (..., 4, 4) are.
+    """
+    R_error = poses[..., :3, :3] @ transpose(true_poses[..., :3, :3])
+    return np.concatenate([so3.log(R_error), poses[..., :3, 3] - true_poses[..., :3, 3]], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkErrors:
+    """Errors of a map after one rigid alignment of the landmarks whose truth is known.
+
+    ``errors`` (m, 3) are aligned estimate minus truth, metres, of the landmarks ``ids`` (m,) in
+    both maps; ``alignment`` (4, 4) leads from the estimate's world to the truth's.
+    """
+
+    ids: IntArray
+    alignment: FloatArray
+    errors: FloatArray
+
+    @property
+    def rmse_m(self) -> float:
+        """RMSE of the landmark positions, metres."""
+        return root_mean_square(self.errors)
+
+
+def landmark_errors(
+    ids: IntArray, world_points: FloatArray, truth: LandmarkTruth
+) -> LandmarkErrors:
+    """Compare a map, of ids (n,) that are each there once, with the truth after rigid alignment.
+
+    Raises an EvaluationError if no landmark is in both maps.
+    """
+    common, rows, true_rows = np.intersect1d(ids, truth.ids, return_indices=True)
+    if len(common) == 0:
+        raise EvaluationError('no landmark is in both the estimated map and the true one')
+    points, true_points = world_points[rows], truth.world_points[true_rows]
+    alignment = rigid_alignment(points, true_points)
+    return LandmarkErrors(common, alignment, se3.transform(alignment, points) - true_points)
+
+
+@dataclass(frozen=True, slots=True)
+class Decay:
+    """A straight line in log10 L: its slope, decades per second, and its value at time zero."""
+
+    slope_per_s: float
+    log10_at_zero: float
+
+    def log10_at(self, times_s: FloatArray) -> FloatArray:
+        """Return log10 L on the line at times (k,), seconds."""
+        return self.log10_at_zero + self.slope_per_s * times_s
+
+
+def fit_decay(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> Decay | None:
+    """Fit a line to log10 L over time, after the transient and before rounding is felt.
+
+    L (k,) at ``times_s`` (k,) counts until it first falls below ``floor``, where rounding is felt;
+    the transient is taken to be over at half of that time. None if there are fewer than two
+    values to fit.
+    """
+    below = np.flatnonzero(lyapunov <= floor)
+    end = int(below[0]) if len(below) else len(lyapunov)
+    if end - end // 2 < 2:
+        return None
+    fitted = slice(end // 2, end)
+    slope_per_s, log10_at_zero = np.polyfit(times_s[fitted], np.log10(lyapunov[fitted]), 1)
+    return Decay(float(slope_per_s), float(log10_at_zero))
+
+
+MAX_JOINT = 100
+"""Landmarks whose errors are normalised together, at most: it costs the cube of them."""
+
+ROUNDING = 1e-13
+"""Share of the total variance that rounding may have left out of a direction."""
+
+
+@dataclass(slots=True)
+class ConfigurationError:
+    """Error on the quotient M_n(3) of the paper: the map as the robot sees it, gauge-free.
+
+    After each observation, the RMS over all landmarks known so far of |P̂⁻¹ p̂_i − P⁻¹ p_i|;
+    over a run, the RMS of that. Where a world frame lies plays no part, so nothing is aligned.
+    ``values_m`` are of ``stamps_ns``, when there were landmarks to compare; ``nees`` are the
+    normalised squared errors per degree of freedom, of those with a covariance.
+    """
+
+    stamps_ns: list[int] = field(default_factory=list)
+    values_m: list[float] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
+    _votes: defaultdict[int, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
+
+    def add(
+        self,
+        stamp_ns: int,
+        pose: FloatArray,
+        ids: IntArray,
+        world_points: FloatArray,
+        true_pose: FloatArray,
+        truth: LandmarkTruth,
+        covariance_of: Callable[[IntArray], FloatArray | None] | None = None,
+        seen_ids: IntArray | None = None,
+    ) -> None:
+        """Take in one configuration and the truth at that time, once after each observation.
+
+        Parameters
+        ----------
+        ids : IntArray
+            (n,) landmarks known so far; those without truth are passed over. One whose sensor
+            gave no id stands for the true landmark that it was nearest to most often when it was
+            seen; until then it is passed over, too. At other times drift puts it next to others.
+        covariance_of : callable, optional
+            Gives the joint covariance (m k, m k) of rows (m,) of the landmarks as seen by the
+            robot, of their first k coordinates, m²; None if it is not known.
+        seen_ids : IntArray, optional
+            Which of the landmarks were seen now; by default all.
+
+        """
+        if not len(truth.ids):
+            return
+        seen = se3.transform(se3.inverse(pose), world_points)
+        true_seen = se3.transform(se3.inverse(true_pose), truth.world_points)
+
+        # Which true landmark each is
+        without_id = is_automatic(ids)
+        if np.count_nonzero(without_id):
+            without_id &= np.isin(ids, ids if seen_ids is None else seen_ids)
+            self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
+        rows, true_rows = np.nonzero(self.true_ids(ids)[:, None] == truth.ids)
+        if not len(rows):
+            return
+
+        # How far it is off, and how likely that is
+        self.stamps_ns.append(stamp_ns)
+        errors = seen[rows] - true_seen[true_rows]
+        self.values_m.append(root_mean_square(errors))
+        if covariance_of is not None:
+            some = slice(None, None, -(-len(rows) // MAX_JOINT))
+            P = covariance_of(rows[some])
+            if P is not None:
+                self.nees.append(_nees(errors[some], P))
+
+    def _vote(
+        self, ids: IntArray, seen: FloatArray, true_ids: IntArray, true_seen: FloatArray
+    ) -> None:
+        """Count for each landmark (n, 3) which true one (m, 3) is the nearest now."""
+        for landmark_id, point in zip(ids.tolist(), seen, strict=True):
+            nearest = np.argmin(np.linalg.norm(true_seen - point, axis=1))
+            self._votes[landmark_id][int(true_ids[nearest])] += 1
+
+    def true_ids(self, ids: IntArray) -> IntArray:
+        """Return the true landmark (n,) that each stands for; its own id where it had one."""
+        return np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
+
+    def _true_id(self, landmark_id: int) -> int:
+        votes = self._votes.get(landmark_id)
+        return landmark_id if votes is None else votes.most_common(1)[0][0]
+
+    @property
+    def anees(self) -> float | None:
+        """Mean of the normalised squared errors; None if there are none."""
+        return float(np.mean(self.nees)) if self.nees else None
+
+    @property
+    def rmse_m(self) -> float | None:
+        """RMS over the run, metres; None before anything could be compared."""
+        return root_mean_square(np.array(self.values_m)) if self.values_m else None
+
+
+def _nees(errors: FloatArray, P: FloatArray) -> float:
+    """Return eᵀ P⁻¹ e per degree of freedom of errors (m, 3); P (m k, m k) has k of them."""
+    e = errors[:, : len(P) // len(errors)].ravel()
+    regular = P + ROUNDING * np.trace(P) * np.eye(len(P))
+    return float(e @ np.linalg.solve(regular, e)) / len(e)

@@ -1,1 +1,0 @@
-"""One hypothesis: the filter, its landmarks, and the step."""

@@ -1,0 +1,241 @@
+"""Which landmarks the points of an observation are, where the sensor gave no ids.
+
+An *assignment* takes each such point for a known landmark, or for a new one, and so puts the robot
+at some pose. Of assignments that agree on the pose, within the sensor's noise, the most likely one
+is taken. Assignments that disagree are all returned, for later observations to decide
+(:mod:`slam_observer_ros.tracking.hypotheses`).
+
+A point with a new id may be of a landmark that had none so far, but only where the state predicts
+that landmark as well as the sensor measures it: a new id suggests a new landmark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.filter.landmark_table import MIN_LOOP
+from slam_observer_ros.filter.observer import Observer, Residuals
+from slam_observer_ros.filter.robust import accepted
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.axes import SPATIAL
+from slam_observer_ros.lie.matrices import (
+    cholesky,
+    diagonal_blocks,
+    mahalanobis,
+    transpose,
+    with_blocks,
+)
+from slam_observer_ros.tracking.hypothesis import LandmarkIndex
+from slam_observer_ros.tracking.joint_compatibility import (
+    columns_of,
+    JointSearch,
+    Pairing,
+    Pairs,
+    pruning_cost,
+    RESOLUTION,
+    unpaired_cost,
+)
+from slam_observer_ros.tracking.matching import sensitivity
+from slam_observer_ros.tracking.state import State
+
+MAX_CANDIDATES = 10
+"""Landmarks that a point may be taken for; the nearest, if there are more."""
+
+HARDLY_MOVED = 0.5 * RESOLUTION
+"""Shift of the points, in standard deviations of the sensor, up to which a correction hardly moves
+the robot: then no other assignment has to be looked for.
+"""
+
+UNCERTAIN = 3.0
+"""Deviation of an old landmark's prediction, over the sensor's, from which on it does not show
+which of several landmarks a point is of: such pairs are held back.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """What the points of an observation are taken for."""
+
+    rows: IntArray  # (m,) row of the landmark that each point is, −1 for a new one
+    cost: float  # −2 ln of its likelihood; a part that all assignments share is left out
+
+
+def find_assignments(
+    state: State,
+    index: LandmarkIndex,
+    event: ObservationEvent,
+    new_cost: float,
+    budget: float,
+    is_alone: bool,
+) -> list[Assignment]:
+    """Return all assignments that put the robot at different poses, the most likely first.
+
+    ``state`` is at the instant of ``event``, an observation of m points, and ``index`` has
+    its landmarks. A point without an id costs ``new_cost`` if it is of a new landmark. None costs
+    more than ``budget``. Where the state ``is_alone``, costs matter only to each other.
+    """
+    # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
+    axes, m = state.axes, len(event.ids)
+    seen = _Points(state, event)
+    at, rows = _candidates(state, index, seen)
+    residuals = _as_residuals(state.observer, seen, at, rows)
+    r, noise = residuals.on(axes)
+    # Which points are of a known landmark in any case: nearly always all, and each of one.
+    certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
+    if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at) == m:
+        return [Assignment(_taken(m, at, rows), 0.0)]
+    PC, CPC = state.known_errors.predicted(residuals)
+    pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
+    # The cost of a point that is of no landmark.
+    gate_cost = unpaired_cost(state.settings.rejection_threshold)
+    none_costs = np.where(event.ids == UNKNOWN_ID, new_cost, gate_cost)
+    unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
+    # Points outside the search; one of no landmark costs the same whatever it might have been.
+    fixed_cost = float(none_costs.sum() - unpaired_costs[np.unique(at)].sum())
+    margin = 0.0 if certain.all() else pruning_cost(event.ids)
+    search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
+    moves = _PoseMoves(state, seen, PC)
+    # Nearly always each point may be of one landmark, and all together hardly move the robot.
+    are_single = len(np.unique(at)) == len(np.unique(rows)) == len(at) > 0
+    whole = search.all_pairs() if are_single else None
+    is_enough = whole is not None and _largest(moves.by(whole)) <= HARDLY_MOVED
+    pairings = [whole] if whole is not None and is_enough else moves.distinct(search.pairings())
+    return [
+        Assignment(_taken(m, at[each.chosen], rows[each.chosen]), each.cost + fixed_cost)
+        for each in pairings
+    ]
+
+
+class _PoseMoves:
+    """How far pairings move the robot: by the shift of the points, in the sensor's σ."""
+
+    def __init__(self, state: State, seen: _Points, PC: FloatArray) -> None:
+        axes = state.axes
+        scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
+        self._J = scale @ axes.output_matrix(seen.points)  # points by a pose error
+        self._PC, self._k = PC, axes.point
+
+    def by(self, pairing: Pairing) -> FloatArray:
+        """Return how far (m, k) the points move by the correction that a pairing makes."""
+        of_pairs = self._PC[:, columns_of(pairing.chosen, self._k)]
+        return np.asarray(self._J @ (of_pairs @ (pairing.L.T @ pairing.z)))
+
+    def distinct(self, pairings: list[Pairing]) -> list[Pairing]:
+        """Return the first pairing of all that put the robot at one pose."""
+        distinct: list[Pairing] = []
+        moves: list[FloatArray] = []
+        for pairing in pairings:
+            move = self.by(pairing)
+            if all(_largest(move - other) > RESOLUTION for other in moves):
+                distinct.append(pairing)
+                moves.append(move)
+        return distinct
+
+
+def _taken(m: int, at: IntArray, rows: IntArray) -> IntArray:
+    """Return the landmark (m,) of each point, −1 but for the points ``at`` (q,)."""
+    taken = np.full(m, -1)
+    taken[at] = rows
+    return taken
+
+
+class _Points:
+    """The points of an observation in the reference frame, and what their ids say."""
+
+    def __init__(self, state: State, event: ObservationEvent) -> None:
+        self.stamp_ns = event.stamp_ns
+        self.points = se3.transform(state.observer.A, event.points)  # (m, 3) Â y_i, metres
+        # (m, 3, 3) their covariances, m²
+        self.noise = state.observer.turned(state.observation_noise.covariances(event))
+        # (m,) rows of the landmarks whose ids they have, −1 for none; whether an id is new
+        self.known_rows = state.landmarks.rows_of(event.ids)
+        # (m, 3, c) how they change with the calibration
+        self.D = sensitivity(state, event)
+        self.is_new_id = (event.ids != UNKNOWN_ID) & (self.known_rows < 0)
+
+
+def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
+    """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate."""
+    at, rows = _pairs_near(state, index, seen)
+    allowed = _may_be(state, seen, at, rows)
+    at, rows = at[allowed], rows[allowed]
+    residuals = _as_residuals(state.observer, seen, at, rows)
+    distances = state.gains.distances(residuals)
+    held_back = _are_held_back(state, seen, residuals, at, distances)
+    at, rows, distances = at[~held_back], rows[~held_back], distances[~held_back]
+    # Each pair passes the gate alone; a point keeps its nearest landmarks.
+    order = np.lexsort((distances, at))
+    rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
+    passes = accepted(distances[order], state.settings.rejection_threshold)
+    near = order[(rank < MAX_CANDIDATES) & passes]
+    return at[near], rows[near]
+
+
+def _are_held_back(
+    state: State, seen: _Points, residuals: Residuals, at: IntArray, distances: FloatArray
+) -> BoolArray:
+    """Return which pairs (q,) of a point and an old landmark are not decided yet.
+
+    The point may be of many old landmarks, and there are many new ones: how these lie will show
+    later which of the old ones they are.
+    """
+    landmarks, rows, stamp_ns = state.landmarks, residuals.rows, seen.stamp_ns
+    held_back = np.zeros(len(at), dtype=np.bool_)
+    passes = accepted(distances, state.settings.rejection_threshold)
+    rivals = np.bincount(at[passes], minlength=len(seen.points))[at] if len(at) else at
+    may_be = passes & (rivals >= MIN_LOOP) & landmarks.are_old(rows, stamp_ns)
+    if not state.is_mapping or not may_be.any():
+        return held_back
+    if np.count_nonzero(landmarks.are_new(state.confirmed, stamp_ns)) < MIN_LOOP:
+        return held_back
+    residuals = residuals.select(may_be)
+    noise = residuals.on(state.axes)[1]
+    predicted = diagonal_blocks(state.known_errors.predicted(residuals)[1], noise.shape[1])
+    held_back[may_be] = np.trace(predicted, axis1=1, axis2=2) > UNCERTAIN**2 * np.trace(
+        noise, axis1=1, axis2=2
+    )
+    return held_back
+
+
+def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
+    """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
+    errors = state.known_errors
+    of_pose, of_landmarks = errors.pose_covariance(), errors.landmark_covariances()
+    C = SPATIAL.output_matrix(seen.points)
+    of_points = C @ of_pose @ transpose(C) + seen.noise
+    spread_m = _spread_m(of_points) + np.max(_spread_m(of_landmarks), initial=0.0)
+    if seen.D is not None:
+        deviations = np.sqrt(state.gains.calibration_variances)
+        spread_m = spread_m + np.linalg.norm(seen.D, axis=1) @ deviations
+    reach_m = state.settings.rejection_threshold * spread_m
+    return index.near(state.observer.points, seen.points, reach_m)
+
+
+def _may_be(state: State, seen: _Points, at: IntArray, rows: IntArray) -> BoolArray:
+    """Return which pairs (q,) of a point and a landmark the ids of the points allow."""
+    is_automatic_id = is_automatic(state.landmarks.ids)
+    others = ~np.isin(rows, seen.known_rows) & (~seen.is_new_id[at] | is_automatic_id[rows])
+    known_rows = seen.known_rows[at]
+    return np.asarray(np.where(known_rows >= 0, rows == known_rows, others))
+
+
+def _as_residuals(observer: Observer, seen: _Points, at: IntArray, rows: IntArray) -> Residuals:
+    """Return the residuals if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
+    a = observer.translations(rows)
+    e = seen.points[at] - a
+    r, D = e - observer.y_ref[rows], None if seen.D is None else seen.D[at]
+    return Residuals(rows, e, r, a, seen.noise[at], np.zeros(len(rows)), np.ones(len(rows)), D)
+
+
+def _largest(vectors: FloatArray) -> float:
+    """Return the largest norm of vectors (m, k)."""
+    return float(np.sqrt((vectors * vectors).sum(axis=1).max()))
+
+
+def _spread_m(covariances: FloatArray) -> FloatArray:
+    """Return a bound on the standard deviation (m,) in any direction, of (m, 3, 3), metres."""
+    return np.asarray(np.sqrt(np.trace(covariances, axis1=1, axis2=2)))

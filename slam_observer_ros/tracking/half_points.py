@@ -1,0 +1,374 @@
+"""Half points, bearings or ranges alone, completed to points that the step can use.
+
+A half point is a point once there is something to complete it with: of a known landmark by the
+estimate, at each observation, which is where the residual is linearised; of a new one by the past
+(:mod:`.waiting_room`). In the directions that were not measured a completed point may be off by
+``UNMEASURED_M``: its residual there is zero, and says nothing. So rows H = uᵀ of the measured
+directions and a completed point are the same correction, but for rounding.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import Outcomes, Reason, Update
+from slam_observer_ros.events import (
+    AZIMUTH,
+    AZIMUTH_RANGE,
+    BEARING,
+    ObservationEvent,
+    POINT,
+    RANGE,
+)
+from slam_observer_ros.filter.robust import straight_odds, straight_share
+from slam_observer_ros.lie.matrices import diagonal_blocks
+from slam_observer_ros.lie.sensor_mounting import directions_of
+from slam_observer_ros.models.observation_noise import point_covariances
+from slam_observer_ros.tracking.matching import calibrated, residuals_of
+from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.waiting_room import (
+    LEAST_MOVE_M,
+    sensor_values,
+    WaitingRoom,
+    Window,
+)
+
+UNMEASURED_M = 1e3
+"""Standard deviation of a completed point where nothing was measured: as large as a message may
+state one."""
+
+MEASURED = np.array(
+    [
+        [True, True, True],
+        [False, True, True],
+        [True, False, False],
+        [False, True, False],
+        [True, True, False],
+    ]
+)
+"""Which of range, azimuth and elevation is measured, by kind."""
+
+KEPT, FEWEST = 200, 40
+"""Differences of ranges that are kept, and that it takes to judge them."""
+
+LEAST_ANCHORS = 3
+"""Landmarks among which one that is off is known from those that are not."""
+
+LEAST_SHARE = 1e-3
+"""Probability of a straight way below which a range says nothing, either way."""
+
+LEAST_LEVEL = 0.1
+"""Cosine of the steepest line of sight, 84°, whose range says something in the plane."""
+
+_LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class HalfPoints:
+    """Completes what sensors measure, by a state and by the views that wait."""
+
+    def __init__(self, counts: Outcomes) -> None:
+        self._counts = counts
+        self._waiting, self.window = WaitingRoom(), Window()
+        self.heights_m: Mapping[int, float] = {}  # of the landmarks of a loaded map
+        self.offsets = RangeOffsets()
+        self.mapped_ids = np.empty(0, dtype=np.int64)  # of the landmarks of loaded maps
+
+    def clear(self) -> None:
+        """Forget the views that wait: time or frame are others."""
+        self._waiting, self.window = WaitingRoom(), Window()
+        self.offsets = RangeOffsets()
+
+    @property
+    def open_sides(self) -> list[int]:
+        """Ids of new landmarks whose views fit two places."""
+        return sorted(self._waiting.open_sides)
+
+    def levelled(self, event: ObservationEvent) -> ObservationEvent:
+        """Return ranges in space as they are in the plane, where landmarks' heights are known."""
+        if event.kinds is None or not self.heights_m:
+            return event
+        lines = event.lines_of_sight
+        sensor_z = event.points[:, 2] - lines[:, 2]
+        known = [self.heights_m.get(landmark_id, math.nan) for landmark_id in event.ids.tolist()]
+        rise_m, range_m = np.array(known) - sensor_z, np.linalg.norm(lines, axis=1)
+        ranges_alone = (event.kinds == RANGE) & np.isfinite(rise_m) & (range_m > 0.0)
+        level = np.ones(len(lines))
+        share = np.clip(rise_m[ranges_alone] / range_m[ranges_alone], -1.0, 1.0)
+        level[ranges_alone] = np.maximum(np.sqrt(1.0 - share**2), LEAST_LEVEL)
+        covariances = event.covariances
+        if covariances is not None:
+            covariances = covariances / level[:, None, None] ** 2
+        points = event.points + (level - 1.0)[:, None] * lines
+        return replace(event, points=points, covariances=covariances)
+
+    def completed(
+        self, event: ObservationEvent, state: State, *, is_lost: bool
+    ) -> ObservationEvent:
+        """Return an observation whose points are whole; points of which nothing is known wait.
+
+        Of a robot that ``is_lost`` in a map the points of its landmarks go to the :attr:`window`.
+        """
+        if event.kinds is None or not (event.kinds != POINT).any():
+            return event
+        # Zero residuals where nothing was measured would say that the motion is exact.
+        state.motion_noise.factors.forget_motion()
+        event = _with_sensor(state, event)
+        rows = state.landmarks.rows_of(event.ids)
+        lines, covariances = _completed(state, event, rows)
+        entered = np.zeros(len(rows), dtype=np.bool_)
+        is_sought = is_lost & np.isin(event.ids, self.mapped_ids)
+        if is_sought.any():
+            _, measured = _completed(state, event, np.full(len(rows), -1))
+            for row in np.flatnonzero(is_sought).tolist():
+                self.window.add(state, event, row, measured[row])
+        if state.is_mapping:
+            is_new = (rows < 0) & (event.kinds != POINT) & ~is_sought
+            for row in np.flatnonzero(is_new).tolist():
+                found = self._waiting.add(state, event, row, covariances[row])
+                if found is not None:
+                    lines[row], covariances[row] = found
+                    entered[row] = True
+        usable = (rows >= 0) | (event.kinds == POINT) | entered
+        self._counts.note(Reason.WAITING, event.ids[~usable], event.stamp_ns)
+        kinds = np.asarray(event.kinds)
+        kinds = np.where(entered, POINT, kinds)
+        points = event.points - event.lines_of_sight + lines
+        whole = replace(event, points=points, covariances=covariances, kinds=kinds)
+        covariances = self._without_detours(state, whole, rows, event)
+        return replace(whole, covariances=covariances).select(usable)
+
+    def _without_detours(
+        self, state: State, event: ObservationEvent, rows: IntArray, of_shown: ObservationEvent
+    ) -> FloatArray:
+        """Return the covariances (m, 3, 3) of a completed event, larger of ranges too long.
+
+        A range that is long within the gate counts by the probability that it came straight: its
+        variance is divided by that. Beyond the gate it is rejected as any other.
+        """
+        covariances = np.asarray(event.covariances)
+        is_half = np.asarray(of_shown.kinds) != POINT
+        measures = MEASURED[of_axes(of_shown.kinds, state)][:, 0]
+        # Landmarks that ranges have put where they are have the detours of these in them.
+        is_range = is_half & measures & (rows >= 0) & np.isin(event.ids, self.mapped_ids)
+        S = _expected_covariances(state, event.select(is_range), rows[is_range])
+        if S is None:
+            return covariances
+        shown, lines = of_shown.lines_of_sight[is_range], event.lines_of_sight[is_range]
+        ranges_m = np.linalg.norm(shown, axis=1)
+        expected = expected_lines(state, of_shown.select(is_range), rows[is_range])
+        off_m = ranges_m - np.linalg.norm(expected, axis=1)
+        along = lines / np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-9)
+        own = np.einsum('mi,mij,mj->m', along, covariances[is_range], along)
+        sigmas_m = np.sqrt(np.einsum('mi,mij,mj->m', along, S, along))
+        self.offsets.note(event.ids[is_range], off_m, sigmas_m, np.sqrt(own), state)
+        noise_m = self.offsets.noisier * sigmas_m
+        share = straight_share(off_m / noise_m, straight_odds(noise_m, ranges_m))
+        share[off_m > state.settings.rejection_threshold * sigmas_m] = 1.0
+        more = own * (1.0 / np.maximum(share, LEAST_SHARE) - 1.0)
+        larger: FloatArray = covariances.copy()
+        larger[is_range] += more[:, None, None] * along[:, :, None] * along[:, None, :]
+        return larger
+
+
+class RangeOffsets:
+    """By how much ranges from each landmark are longer than expected, along the way."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, deque[tuple[float, float]]] = {}
+        self._short: deque[float] = deque(maxlen=KEPT)
+        self._last_at = np.full(3, np.inf)
+
+    def note(
+        self,
+        ids: IntArray,
+        off_m: FloatArray,
+        sigmas_m: FloatArray,
+        own_m: FloatArray,
+        state: State,
+    ) -> None:
+        """Note differences (m,), their standard deviations, and the sensor's part of these."""
+        at = state.observer.A[:3, 3]
+        if np.linalg.norm(at - self._last_at) < LEAST_MOVE_M:
+            return  # from one place all have the same error
+        self._last_at = at.copy()
+        for landmark_id, *difference in zip(
+            ids.tolist(), off_m.tolist(), own_m.tolist(), strict=True
+        ):
+            kept = self._of.setdefault(landmark_id, deque(maxlen=KEPT))
+            kept.append((difference[0], difference[1]))
+        self._short.extend((-off_m / sigmas_m)[off_m < 0.0].tolist())
+
+    @property
+    def noisier(self) -> float:
+        """How many times as noisy as stated ranges are: 1 or more, by those that are too short.
+
+        Nothing but noise makes a range too short, so that detours have no part in it.
+        """
+        if len(self._short) < FEWEST:
+            return 1.0
+        return max(math.sqrt(float(np.mean(np.square(self._short)))), 1.0)
+
+    @property
+    def constant(self) -> dict[int, float]:
+        """Metres by which landmarks' ranges are off everywhere, beyond what all have in common.
+
+        In each quarter of what was seen of them they are so by at least half of it, and by more
+        than a standard deviation of the sensor.
+        """
+        enough = {each: np.array(kept) for each, kept in self._of.items() if len(kept) >= FEWEST}
+        if len(enough) < LEAST_ANCHORS:
+            return {}
+        medians = {each: float(np.median(kept[:, 0])) for each, kept in enough.items()}
+        common = float(np.median(list(medians.values())))
+        biased = {}
+        for each, kept in enough.items():
+            off_m = medians[each] - common
+            quarters = [np.median(part) - common for part in np.array_split(kept[:, 0], 4)]
+            is_constant = min(float(part) / off_m for part in quarters) > 0.5 if off_m else False
+            if is_constant and abs(off_m) > float(np.median(kept[:, 1])):
+                biased[each] = off_m
+        return biased
+
+
+def _expected_covariances(
+    state: State, event: ObservationEvent, rows: IntArray
+) -> FloatArray | None:
+    """Return how far off points of landmarks may be seen (m, 3, 3), body axes, m²; or None."""
+    if not len(rows):
+        return None
+    event, k = calibrated(state, event), state.axes.point
+    residuals = residuals_of(state, event, rows, np.asarray(event.covariances))
+    S = state.gains.innovation_covariance(residuals)
+    if not len(S):
+        return None
+    full = np.zeros((len(rows), 3, 3))
+    full[:, :k, :k] = diagonal_blocks(S, k)
+    R = state.observer.A[:3, :3]
+    turned: FloatArray = R.T @ full @ R
+    return turned
+
+
+def judged(update: Update, event: ObservationEvent, state: State) -> Update:
+    """Return what came of a completed observation without the directions not measured."""
+    if event.kinds is None:
+        return update
+    by_id = dict(zip(event.ids.tolist(), event.kinds.tolist(), strict=True))
+    kinds = np.array([by_id.get(each, POINT) for each in update.ids.tolist()], dtype=np.int64)
+    update, innovation = replace(update, kinds=kinds), update.innovation
+    if innovation is None:
+        return update
+    k = state.axes.point
+    missing = k - measured_directions(kinds, k)
+    unmeasured = missing * (math.log(UNMEASURED_M) + _LOG_ROOT_2_PI)
+    used = innovation.weights > 0.0
+    degrees = innovation.degrees_of_freedom
+    return replace(
+        update,
+        innovation=replace(
+            innovation,
+            degrees_of_freedom=max(degrees - int(missing[used].sum()), 0) if degrees else 0,
+            log_densities=innovation.log_densities + unmeasured,
+        ),
+    )
+
+
+def measured_directions(kinds: IntArray, k: int) -> IntArray:
+    """Return how many directions (m,) of points in k dimensions are measured, by kind."""
+    count: IntArray = MEASURED[kinds][:, :k].sum(axis=1)
+    return count
+
+
+def _with_sensor(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Let a sensor whose calibration is estimated be known before it is asked for."""
+    calibration = state.calibration
+    if calibration.corrects_points and event.sensor_frame not in calibration.sensors:
+        state.add_sensor(event.sensor_frame)
+    return event
+
+
+def _completed(
+    state: State, event: ObservationEvent, rows: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return lines of sight (m, 3) as a sensor would have shown them, and their covariances.
+
+    Of landmarks that are not known, with what was measured alone.
+    """
+    shown, expected = event.lines_of_sight, event.lines_of_sight.copy()
+    known = rows >= 0
+    if known.any():
+        expected[known] = expected_lines(state, event.select(known), rows[known])
+    kinds = of_axes(event.kinds, state)
+    lines = _combined(shown, expected, MEASURED[kinds])
+    return lines, _covariances(state, event, lines, kinds)
+
+
+def of_axes(kinds: IntArray | None, state: State) -> IntArray:
+    """Return kinds as they are in the plane, too, where an azimuth is a whole direction."""
+    whole = {AZIMUTH: BEARING, AZIMUTH_RANGE: POINT} if state.axes.point == 2 else {}
+    all_kinds = np.asarray(kinds)
+    for azimuth, kind in whole.items():
+        all_kinds = np.where(all_kinds == azimuth, kind, all_kinds)
+    return all_kinds
+
+
+def expected_lines(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    """Return how a sensor would show landmarks ``rows`` (m,), by its calibration, body axes."""
+    R, shift, scale = sensor_values(state, event)
+    origins = event.points - event.lines_of_sight + shift
+    lines = state.observer.body_points(rows) - origins
+    if state.axes.point == 2:
+        lines[:, 2] = 0.0
+    shown: FloatArray = lines @ R / scale
+    return shown
+
+
+def _combined(shown: FloatArray, expected: FloatArray, measured: BoolArray) -> FloatArray:
+    """Return lines of sight (m, 3) of what is ``measured`` (m, 3), and of what is expected."""
+    measured_range, measured_azimuth, measured_elevation = measured.T
+    level = np.hypot(expected[:, 0], expected[:, 1])
+    source = np.where(measured_azimuth[:, None], shown, expected)
+    azimuth = np.arctan2(source[:, 1], source[:, 0])
+    rise = np.arctan2(expected[:, 2], level)
+    rise_shown = np.arctan2(shown[:, 2], np.hypot(shown[:, 0], shown[:, 1]))
+    elevation = np.where(measured_elevation, rise_shown, rise)
+    directions = np.column_stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    lengths = np.linalg.norm(np.where(measured_range[:, None], shown, expected), axis=1)
+    lines: FloatArray = lengths[:, None] * directions
+    return lines
+
+
+def _covariances(
+    state: State, event: ObservationEvent, lines: FloatArray, kinds: IntArray
+) -> FloatArray:
+    """Return covariances (m, 3, 3) of lines of sight: as measured, and anywhere else."""
+    noise = state.observation_noise
+    modelled = point_covariances(lines, noise.figures)
+    basis, lengths = directions_of(lines), np.linalg.norm(lines, axis=1)
+    variances = np.einsum('mij,mjk,mik->mi', basis, modelled, basis)
+    stated = event.covariances
+    if stated is not None:
+        own = directions_of(event.lines_of_sight)
+        of_shown = np.einsum('mij,mjk,mik->mi', own, stated, own)
+        # What is stated of a unit vector is an angle.
+        is_unit = ~MEASURED[kinds][:, 0]
+        of_shown[is_unit, 1:] *= lengths[is_unit, None] ** 2
+        is_stated = stated.any(axis=(1, 2))
+        variances[is_stated] = of_shown[is_stated]
+    variances = np.where(MEASURED[kinds], variances, UNMEASURED_M**2)
+    covariances: FloatArray = np.einsum('mij,mi,mik->mjk', basis, variances, basis)
+    if stated is not None:
+        whole = (kinds == POINT) & stated.any(axis=(1, 2))
+        covariances[whole] = stated[whole]
+    return covariances

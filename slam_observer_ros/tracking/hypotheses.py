@@ -1,0 +1,541 @@
+"""Hypotheses: states that take what was seen for different things (:mod:`.interpretations`).
+
+Where two interpretations of an observation put the robot at different poses, both are followed,
+each with a state of its own, until later observations have made one much more likely than the
+other (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are two that take the
+points for different landmarks at the same pose: their maps differ. Where landmarks have ids or are
+well separated there is nearly always one hypothesis.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray, IntArray, is_automatic
+from slam_observer_ros.estimates import (
+    Ambiguity,
+    CalibrationEstimate,
+    Change,
+    DELAY_NAME,
+    Outcome,
+    Outcomes,
+    Reason,
+    Update,
+)
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.matrices import cholesky, mahalanobis, transpose
+from slam_observer_ros.models.integration import DelayEvidence
+from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.tracking import in_parts, usual
+from slam_observer_ros.tracking.costs import NewLandmarks
+from slam_observer_ros.tracking.covariances import of_pose
+from slam_observer_ros.tracking.hypothesis import Hypothesis
+from slam_observer_ros.tracking.interpretations import (
+    as_its_ids_say,
+    Interpretation,
+    interpretations,
+    is_contradicted,
+    may_name,
+)
+from slam_observer_ros.tracking.joint_compatibility import (
+    pruning_cost,
+    RESOLUTION,
+    unpaired_cost,
+)
+from slam_observer_ros.tracking.matching import calibrated, match, MatchedObservation
+from slam_observer_ros.tracking.standing import MAX_MOTIONS, Standing, take_back
+from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.step import step
+
+MOST_WITHOUT_IDS = 2
+"""Hypotheses that are followed at most where points have no ids: each costs as much as the first,
+and a third one is hardly ever the right one.
+"""
+
+
+AMBIGUOUS = 4.0
+"""Deviation of the pose by all hypotheses, over what the best one states, in any direction, from
+which on they are several maps and not one.
+"""
+
+AMBIGUOUS_NS = 5_000_000_000
+"""How long that has to last, nanoseconds: what the next views decide is no news."""
+
+LEAST_DEVIATION = 0.01
+"""Deviation of a pose, rad and m, within which poses are the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Child:
+    """A hypothesis after an observation, the meaning that it took it in, and what that did."""
+
+    hypothesis: Hypothesis
+    event: ObservationEvent
+    update: Update
+
+
+class Hypotheses:
+    """Hypotheses about pose and map, the most likely first; at the start there is one."""
+
+    def __init__(self, state: State) -> None:
+        self._earlier_counts = Outcomes()
+        self._start(state)
+
+    def reset(self, state: State) -> None:
+        """Replace all hypotheses by a new one."""
+        self._earlier_counts.add(self.best.counts)
+        self._start(state)
+
+    def _start(self, state: State) -> None:
+        self._all = [Hypothesis.of(state)]
+        # Else points have ids, and are what these say.
+        self._can_weigh = state.errors is not None
+        self._limit = state.settings.max_hypotheses
+        self._next_id = FIRST_AUTOMATIC_ID
+        self._some_have_ids = False
+        self._new_landmarks = NewLandmarks()
+        self._standing = Standing()
+        self._velocities: VelocityHistory | None = None  # along which they were moved
+        self._delay_evidence = DelayEvidence()
+        self._present: Ambiguity | None = None
+        self._longest: Ambiguity | None = None
+
+    @property
+    def ambiguity(self) -> Ambiguity | None:
+        """Since when what is seen fits several maps; None if it does not, or only for a moment."""
+        return _lasting(self._present)
+
+    @property
+    def longest_ambiguity(self) -> Ambiguity | None:
+        """The longest time in which it did, since the start."""
+        return _lasting(self._longest)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Outcomes for landmarks, in the most likely state and those given up by resets."""
+        return self._earlier_counts + self.best.counts
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """What became of points and landmarks, as :attr:`counts` counts it, if that was kept."""
+        return self._earlier_counts.each + self.best.counts.each
+
+    def some_counts(self, names: Iterable[str]) -> list[int]:
+        """Return some of the :attr:`counts`, without adding up all of them."""
+        earlier, counts = self._earlier_counts, self.best.counts
+        return [earlier.get(name, 0) + counts.get(name, 0) for name in names]
+
+    def __len__(self) -> int:
+        """Return how many hypotheses there are."""
+        return len(self._all)
+
+    @property
+    def best(self) -> State:
+        """The most likely state."""
+        return self._all[0].state
+
+    @property
+    def missed(self) -> float:
+        """Landmarks that should have been among the points without ids seen last, and were not."""
+        return self._all[0].visibility.missed
+
+    def prune_to_best(self) -> State:
+        """Give up all hypotheses but the most likely one, and return its state."""
+        self._all = self._all[:1]
+        return self.best
+
+    def pose_after(
+        self, velocities: VelocityHistory, start_ns: int, end_ns: int
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the most likely pose (4, 4) at ``end_ns``, and its covariance (6, 6) if known.
+
+        Hypotheses are moved on from ``start_ns``, and the most likely one may be wrong.
+        """
+        of_each = [
+            usual.pose_after(one.state, velocities, start_ns, end_ns)
+            or one.state.pose_after(velocities, start_ns, end_ns)
+            for one in self._all
+        ]
+        return of_each[0][0], self._mixed(of_each)
+
+    def poses_until(
+        self,
+        velocities: VelocityHistory,
+        start_ns: int,
+        stamps_ns: IntArray,
+        with_covariances: bool,
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the most likely poses (s, 4, 4) at stamps (s,), and their covariances (s, 6, 6).
+
+        As :meth:`.State.poses_until` of each hypothesis.
+        """
+        if not with_covariances:
+            passage = self.best.passage(velocities, start_ns, stamps_ns, with_covariances)
+            return self.best.observer.reference_pose @ passage.poses, None
+        of_each = [
+            usual.poses_until(one.state, velocities, start_ns, stamps_ns)
+            or one.state.poses_until(velocities, start_ns, stamps_ns)
+            for one in self._all
+        ]
+        return of_each[0][0], self._mixed(of_each)
+
+    def _mixed(self, of_each: Sequence[tuple[FloatArray, FloatArray | None]]) -> FloatArray | None:
+        """Return the covariance (…, 6, 6) of the first pose (…, 4, 4), by all hypotheses.
+
+        It is Σ w_i (P_i + d_i d_iᵀ), with w_i their likelihoods, and d_i how far their poses are
+        from the first one, in the coordinates of :meth:`.State.pose_after`.
+        """
+        pose, own = of_each[0]
+        if len(of_each) == 1:  # as nearly always
+            return own
+        weights, total = self.weights, own
+        for (other, covariance), weight in zip(of_each[1:], weights[1:].tolist(), strict=True):
+            if total is None or own is None or covariance is None:
+                return None
+            d = _difference(pose, other)
+            total = total + weight * (covariance - own + d[..., :, None] * d[..., None, :])
+        return total
+
+    @property
+    def weights(self) -> FloatArray:
+        """Probabilities (h,) of the hypotheses, as far as one of them is right."""
+        likelihoods = np.exp(-0.5 * np.array([hypothesis.cost for hypothesis in self._all]))
+        return np.asarray(likelihoods / likelihoods.sum())
+
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the joint covariance (m k, m k) of landmarks of the best map, seen by the robot.
+
+        As :meth:`.State.configuration_covariance`, about that map and by all hypotheses. Of a
+        landmark that one of them has not, that one says nothing.
+        """
+        best, k = self.best, self.best.axes.point
+        own = best.configuration_covariance(rows)
+        if own is None or len(self._all) == 1:
+            return own
+        ids, points = best.landmarks.ids[rows], best.observer.body_points(rows)
+        mixed, left = np.zeros_like(own), np.ones(len(own))
+        for hypothesis, weight in zip(self._all[1:], self.weights[1:].tolist(), strict=True):
+            state = hypothesis.state
+            others = state.landmarks.rows_of(ids)
+            known, others = others >= 0, others[others >= 0]
+            covariance = state.configuration_covariance(others)
+            if covariance is None:
+                return None
+            at = np.flatnonzero(np.repeat(known, k))
+            d = (state.observer.body_points(others) - points[known])[:, :k].ravel()
+            mixed[np.ix_(at, at)] += weight * (covariance + np.outer(d, d))
+            left[at] -= weight
+        shares = np.sqrt(left)
+        return shares[:, None] * own * shares + mixed
+
+    def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
+        """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
+        stood_s = velocities.stood_s(end_ns)
+        for hypothesis in self._all:
+            state = hypothesis.state
+            state.observation_noise.stood_s = stood_s
+            before = state.observer.A.copy()
+            variances = usual.advance(state, velocities, start_ns, end_ns)
+            if variances is None:
+                motion = state.motion(velocities, start_ns, end_ns)
+                state.propagate(motion)
+                variances = np.diagonal(motion.covariances.sum(axis=0))
+            if state is not self.best:
+                continue
+            self._standing.moved.append(se3.between(before, state.observer.A))
+            calibration = state.calibration
+            if calibration.delay_error_ns:
+                self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
+        if len(self._standing.moved) > MAX_MOTIONS:
+            self._standing.clear_time()
+        self._velocities = velocities
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """Scale, bias and delay of the velocity in the most likely state."""
+        best, initial_s = self.best, self.best.settings.velocity_delay_stddev
+        return [
+            self._delay_evidence.corrected(part, initial_s) if part.name == DELAY_NAME else part
+            for part in best.calibration.estimates(best.gains.calibration_variances)
+        ]
+
+    def clear_time(self) -> None:
+        """Let all hypotheses go on from where they are at any other time."""
+        self._present = None
+        for hypothesis in self._all:
+            hypothesis.state.clear_time()
+        self._standing.clear_time()
+
+    def forget(self, landmark_id: int) -> bool:
+        """Remove a landmark from all maps; return whether the most likely one had it."""
+        states = [hypothesis.state for hypothesis in self._all]
+        rows = [state.landmarks.rows_of(np.array([landmark_id])) for state in states]
+        for state, row in zip(states, rows, strict=True):
+            if row[0] >= 0:
+                state.remove(row)
+        return bool(rows[0][0] >= 0)
+
+    @property
+    def carried_ids(self) -> set[int]:
+        """Landmarks that move with the robot, and are not used."""
+        return self._standing.carried
+
+    @property
+    def slips(self) -> bool:
+        """Whether the wheels slip now."""
+        return self._standing.slip is not None
+
+    def observe(self, event: ObservationEvent) -> Update:
+        """Use an observation made at their instant; return what it did to the best one."""
+        standing = self._standing
+        if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
+            self._judge(event)
+        if standing.excluded:
+            is_carried = np.isin(event.ids, list(standing.excluded))
+            for hypothesis in self._all:
+                counts = hypothesis.state.counts
+                counts.note(Reason.CARRIED, event.ids[is_carried], event.stamp_ns)
+            event = event.select(~is_carried)
+        update = self._observe(event)
+        self._note_ambiguity(event)
+        return update
+
+    def _note_ambiguity(self, event: ObservationEvent) -> None:
+        """Note whether points without ids fit several maps, after an observation."""
+        are_several = len(self._all) > 1 and bool((event.ids == UNKNOWN_ID).any())
+        if not are_several or self._disagreement() <= AMBIGUOUS:
+            self._present = None
+            return
+        stamp_ns, probability = event.stamp_ns, float(self.weights[0])
+        present = self._present
+        if present is None:
+            position = self.best.observer.pose[:3, 3].copy()
+            present = Ambiguity(stamp_ns, stamp_ns, position, probability)
+        probability = min(present.probability, probability)
+        self._present = present = replace(present, until_ns=stamp_ns, probability=probability)
+        if self._longest is None or present.lasts_ns > self._longest.lasts_ns:
+            self._longest = present
+
+    def _disagreement(self) -> float:
+        """Return the pose's deviation by all hypotheses over that by the best one, at most."""
+        of_each: list[tuple[FloatArray, FloatArray | None]] = []
+        for hypothesis in self._all:
+            observer, errors = hypothesis.state.observer, hypothesis.state.known_errors
+            covariance = of_pose(observer, errors.pose_covariance(), observer.A)
+            of_each.append((observer.pose, covariance))
+        own, mixed = of_each[0][1], self._mixed(of_each)
+        if own is None or mixed is None:
+            return 0.0
+        pose, least = self.best.axes.pose, LEAST_DEVIATION**2
+        L = np.linalg.inv(cholesky(own[pose, pose] + least * np.eye(self.best.axes.p)))
+        spread = L @ (mixed[pose, pose] + least * np.eye(self.best.axes.p)) @ L.T
+        return float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
+
+    def _judge(self, event: ObservationEvent) -> None:
+        """Stop where the wheels spin, and give up landmarks that the robot carries."""
+        standing, best = self._standing, self.best
+        if not self._can_weigh or self._velocities is None:
+            return
+        was_slipping, were_carried = standing.slip is not None, standing.carried
+        lost = standing.note(best, event, self._velocities)
+        newly = standing.carried - were_carried
+        for hypothesis in self._all:
+            state = hypothesis.state
+            if lost is not None:
+                take_back(state, lost)
+                state.counts['slip'] += not was_slipping
+            if newly:
+                state.counts.note(Change.CARRIED, np.array(sorted(newly)), event.stamp_ns)
+        if best.is_mapping:
+            for landmark_id in newly:
+                self.forget(landmark_id)
+
+    def _observe(self, event: ObservationEvent) -> Update:
+        """Use an observation of places."""
+        # Nearly always there is one hypothesis, and one meaning: the step, and no more.
+        if len(self._all) == 1 and (used := in_parts.observe(self.best, event)) is not None:
+            self._some_have_ids = True
+            return used[0]
+        unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
+        self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
+        if not self._can_weigh:
+            return step(self.best, match(self.best, event))
+        matched = match(self.best, event) if len(self._all) == 1 else None
+        if matched is not None and not unknown:
+            is_clear = self._limit == 1 or not is_contradicted(self.best, matched)
+            if is_clear and not may_name(self.best, matched):
+                return step(self.best, matched)
+        # All hypotheses with all meanings; costs are differences to the most likely one.
+        children = self._follow(event, self._interpret(event, matched))
+        least_cost = children[0].hypothesis.cost
+        self._all = [child.hypothesis for child in children]
+        for hypothesis in self._all:
+            hypothesis.cost -= least_cost
+        if unknown:
+            self._new_landmarks.note(event, self._all[0].visibility.confirmed_now)
+        return children[0].update
+
+    def _follow(
+        self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
+    ) -> list[_Child]:
+        """Let hypotheses use an observation as interpreted; return them, the cheapest first."""
+        limit = self._limit
+        if (event.ids == UNKNOWN_ID).all():
+            limit = min(limit, MOST_WITHOUT_IDS)
+        # A state is copied for each use of it but the last.
+        uses = Counter(number for number, taken in possible if taken.slipped is None)
+        children: list[_Child] = []
+        for number, taken in possible:
+            hypothesis = self._all[number]
+            if taken.slipped is not None:
+                hypothesis = hypothesis.with_state(taken.slipped)
+            else:
+                uses[number] -= 1
+                if uses[number]:
+                    hypothesis = hypothesis.copy()
+            # Of hypotheses that become one, the first stands for all.
+            child = self._child(hypothesis, taken, event)
+            if not any(_are_one(child, other) for other in children):
+                children.append(child)
+            if len(children) == limit:
+                break
+        return sorted(children, key=lambda child: child.hypothesis.cost)
+
+    def _child(
+        self, hypothesis: Hypothesis, taken: Interpretation, event: ObservationEvent
+    ) -> _Child:
+        """Let a hypothesis use an observation as one interpretation has it."""
+        state, update = hypothesis.state, taken.update
+        if update is None:
+            state.landmarks.renumber(taken.named_rows, taken.given_ids)
+            update = step(state, taken.matched or match(state, taken.event))
+        hypothesis.cost = taken.cost
+        if (event.ids == UNKNOWN_ID).any():
+            hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
+        return _Child(hypothesis, taken.event, update)
+
+    def _interpret(
+        self, event: ObservationEvent, matched: MatchedObservation | None
+    ) -> list[tuple[int, Interpretation]]:
+        """Return the interpretations by each hypothesis, by its number, the cheapest first.
+
+        Their costs include the hypothesis's own. A point that is taken for a new landmark has
+        the same id in all of them. ``matched`` is the observation as a single hypothesis has
+        matched it, None where there are several.
+        """
+        new_ids, margin = self._new_ids(len(event.ids)), pruning_cost(event.ids)
+        gate_cost = unpaired_cost(self.best.settings.rejection_threshold)
+        new_cost = self._new_landmarks.cost(gate_cost)
+        possible: list[tuple[int, Interpretation]] = []
+        worst = math.inf  # the most that is worth following, the cheapest so far being known
+        for number, hypothesis in enumerate(self._all):
+            cost = hypothesis.cost
+            budget = worst - cost
+            for taken in self._meanings(hypothesis, event, matched, new_ids, new_cost, budget):
+                possible.append((number, replace(taken, cost=cost + taken.cost)))
+                worst = min(worst, cost + taken.cost + margin)
+        possible.sort(key=lambda pair: pair[1].cost)
+        return [(number, taken) for number, taken in possible if taken.cost <= worst]
+
+    def _meanings(
+        self,
+        hypothesis: Hypothesis,
+        event: ObservationEvent,
+        matched: MatchedObservation | None,
+        new_ids: IntArray,
+        new_cost: float,
+        budget: float,
+    ) -> list[Interpretation]:
+        """Return what an observation may mean to a hypothesis: :func:`.interpretations`."""
+        state, index = hypothesis.state, hypothesis.index
+        seen = calibrated(state, event)
+        if matched is not None:
+            return interpretations(state, index, seen, matched, new_ids, new_cost, budget, True)
+        used = in_parts.observe(state, event, with_expected=True)
+        if used is not None:
+            return [as_its_ids_say(state, seen, *used)]
+        matched = match(state, seen)
+        return interpretations(state, index, seen, matched, new_ids, new_cost, budget)
+
+    def _new_ids(self, m: int) -> IntArray:
+        """Return ids (m,) that no landmark of any hypothesis has, nor one of a loaded map."""
+        for hypothesis in self._all:
+            ids = hypothesis.state.landmarks.ids
+            self._next_id = max(self._next_id, int(np.max(ids[is_automatic(ids)], initial=0)) + 1)
+        return self._next_id + np.arange(m)
+
+
+def _lasting(ambiguity: Ambiguity | None) -> Ambiguity | None:
+    lasts = ambiguity is not None and ambiguity.lasts_ns >= AMBIGUOUS_NS
+    return ambiguity if lasts else None
+
+
+def _are_one(child: _Child, other: _Child) -> bool:
+    state, other_state = child.hypothesis.state, other.hypothesis.state
+    if are_one(state, child.event, other_state, other.event):
+        return True
+    # Where landmarks have ids, these will show.
+    without_ids = is_automatic(state.landmarks.ids).all()
+    return bool(without_ids) and have_one_map(state, other_state)
+
+
+def have_one_map(state: State, other: State) -> bool:
+    """Return whether two hypotheses have the same landmarks at the same places about the robot.
+
+    By how well either of them knows where they are, and the sensor would see them: no observation
+    to come will show then which of them is right. Where one of them has a landmark that the other
+    has not, that is yet to be confirmed.
+    """
+    rows, others = state.landmarks.rows_of(other.landmarks.ids), np.arange(len(other.landmarks))
+    is_common = rows >= 0
+    if not other.landmarks.tentative[~is_common].all():
+        return False
+    only_here = np.setdiff1d(np.arange(len(state.landmarks)), rows)
+    if not state.landmarks.tentative[only_here].all():
+        return False
+    rows, others = rows[is_common], others[is_common]
+    return _agree(state, rows, other, others) and _agree(other, others, state, rows)
+
+
+def _agree(state: State, rows: IntArray, other: State, others: IntArray) -> bool:
+    """Return whether a state expects landmarks (m,) where another one has them."""
+    points = other.observer.body_points(others)
+    seen = ObservationEvent(0, state.landmarks.ids[rows], points)
+    noise, m = state.observation_noise.covariances(seen), len(rows)
+    residuals = state.gains.residuals(rows, points, noise, np.zeros(m), np.ones(m))
+    return bool((state.gains.distances(residuals) <= RESOLUTION).all())
+
+
+def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
+    """Return rotation vector and shift (…, 6) from one pose to another, along the world's axes."""
+    turn = so3.log(other[..., :3, :3] @ transpose(pose[..., :3, :3]))
+    return np.concatenate([turn, other[..., :3, 3] - pose[..., :3, 3]], axis=-1)
+
+
+def are_one(
+    state: State, event: ObservationEvent, other: State, other_event: ObservationEvent
+) -> bool:
+    """Return whether two hypotheses, by the points seen, have one pose and one map there.
+
+    They have if the points, and each landmark that either takes one of them for, have the same
+    positions: which was which in this observation does not matter then.
+    """
+    # How far the points seen are from each other, and the landmarks they are taken for.
+    here, there = state.observer.pose, other.observer.pose
+    noise = here[:3, :3] @ state.observation_noise.covariances(event) @ here[:3, :3].T
+    shifts = [se3.transform(here, event.points) - se3.transform(there, event.points)]
+    if not np.array_equal(event.ids, other_event.ids):
+        for ids in (event.ids, other_event.ids):
+            rows, other_rows = state.landmarks.rows_of(ids), other.landmarks.rows_of(ids)
+            if (rows < 0).any() or (other_rows < 0).any():
+                return False
+            own, others = state.observer.world_points, other.observer.world_points
+            shifts.append(own[rows] - others[other_rows])
+    distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
+    return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)

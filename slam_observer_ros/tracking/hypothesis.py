@@ -1,0 +1,258 @@
+"""One of several hypotheses about pose and map: a state, and helpers for points without an id.
+
+For such points there is an index, which finds near landmarks without a search of the whole map,
+and a record of the sensor's view: which landmarks should have been seen, and which were.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, field
+import math
+from typing import Any
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.estimates import Change
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.filter.landmark_table import LandmarkTable
+from slam_observer_ros.lie import se3
+from slam_observer_ros.tracking.state import State
+
+MAX_LOOSE = 256
+"""Landmarks newer than the tree that are searched one by one before it is built again."""
+
+
+class LandmarkIndex:
+    """A k-d tree over landmarks that move a little all the time.
+
+    Every correction moves landmarks by less than the search is wide. So the tree is kept while
+    the largest shift since it was built is below that, and the search is widened by the shift.
+    """
+
+    def __init__(self) -> None:
+        self._built: FloatArray = np.empty((0, 3))
+        self._tree: Any = None  # before the first search
+
+    def near(
+        self, landmarks: FloatArray, points: FloatArray, radii_m: FloatArray
+    ) -> tuple[IntArray, IntArray]:
+        """Return pairs (q,), (q,) of a point and a landmark, by point.
+
+        All pairs closer than the point's radius (m,) are among them, and some that aren't.
+        Landmarks (n, 3), as they are now, and points (m, 3) are in one frame, metres.
+        """
+        shift_m = self._refresh(landmarks, np.min(radii_m, initial=np.inf))
+        near = self._tree.query_ball_point(points, radii_m + shift_m, return_sorted=True)
+        loose = np.arange(len(self._built), len(landmarks))
+        rows = [np.append(np.array(point_rows, dtype=np.int64), loose) for point_rows in near]
+        i = np.repeat(np.arange(len(points)), [len(point_rows) for point_rows in rows])
+        return i, np.concatenate([np.empty(0, dtype=np.int64), *rows])
+
+    def _refresh(self, landmarks: FloatArray, tolerance_m: float) -> float:
+        """Build the tree again if it is too old; return the largest shift since it was built."""
+        shift_m = self._shift_m(landmarks)
+        if self._tree is not None and shift_m <= tolerance_m:
+            return shift_m
+        from scipy.spatial import cKDTree  # which only points without ids need
+
+        self._built = landmarks.copy()
+        self._tree = cKDTree(self._built)
+        return 0.0
+
+    def _shift_m(self, landmarks: FloatArray) -> float:
+        built = len(self._built)
+        if built == 0 or not built <= len(landmarks) <= built + MAX_LOOSE:
+            return np.inf
+        shifts = landmarks[:built] - self._built
+        return float(np.sqrt(np.max(np.einsum('ij,ij->i', shifts, shifts))))
+
+
+HULL_MARGIN = 0.01
+"""How far outside, as a share of what it measures across, a point may be and still be inside.
+
+Points are noisy, and without it each exact one at the sensor's full range would be a corner.
+"""
+
+
+class FieldOfView:
+    """The convex hull, in the body frame, of the base and of all points that were ever seen.
+
+    So no sensor has to be described. The hull is rather too large than too small: one wrong point
+    behind a camera, and it sees all around. Until it has an inside, which it never has where all
+    points lie in one plane with the base, everything counts as in view, and the latest points are
+    kept. Of points, the first ``k`` coordinates matter: 2 in the plane, 3 in space.
+    """
+
+    def __init__(self, k: int) -> None:
+        self.corners = np.zeros((1, k))  # (q, k) the base and points that span the hull, metres
+        self._faces: FloatArray = np.empty((0, k + 1))
+        self._margin_m = 0.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the hull has an inside."""
+        return len(self._faces) > 0
+
+    def include(self, points: FloatArray) -> None:
+        """Add points (m, 3) that were seen, metres, body frame."""
+        from scipy.spatial import ConvexHull, QhullError  # which only points without ids need
+
+        k = self.corners.shape[1]
+        known = self.contains(points) & self.is_known
+        if known.all():
+            return
+        corners = np.concatenate([self.corners, points[~known, :k]])
+        try:
+            hull = ConvexHull(corners)
+        except QhullError:  # all of them in one point, on one line or in one plane
+            self.corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
+            return
+        self.corners, self._faces = corners[hull.vertices], hull.equations
+        self._margin_m = HULL_MARGIN * float(np.ptp(self.corners, axis=0).max())
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Return which points (m, 3) lie where the sensor sees, metres, body frame."""
+        k = self.corners.shape[1]
+        heights_m = points[:, :k] @ self._faces[:, :k].T + self._faces[:, k]
+        return np.asarray((heights_m <= self._margin_m).all(axis=1))
+
+
+IMPROBABLE = 20.0
+"""−ln of the probability below which it is no chance that none of several landmarks is seen."""
+
+MOVED_M = 0.05
+"""Distance, metres, after which a robot looks from another place; and turn, rad."""
+
+MAX_EVIDENCE = 2.0
+"""Evidence of one observation at most: what hides a landmark hides others, and for some time."""
+
+
+class Visibility:
+    """The view of a sensor without ids, in ``k`` = 2 or 3 dimensions: what it sees and misses."""
+
+    def __init__(self, k: int) -> None:
+        self._field_of_view = FieldOfView(k)
+        self.confirmed_now = 0  # how many landmarks without an id the last observation confirmed
+        self._last_place: FloatArray | None = None  # (4, 4) Â, if it moved since the one before
+        # −ln of the probability that for so long none is seen of the landmarks known before: those
+        # without an id that were numbered up to here.
+        self._evidence = 0.0
+        self._newest_number = 0
+        self.missed = 0.0  # confirmed landmarks that should have been seen last, and were not
+        self._in_view, self._seen = 1, 1  # confirmed landmarks so far
+
+    def copy(self) -> Visibility:
+        """Return an independent copy: no array is ever changed in place."""
+        other = copy(self)
+        other._field_of_view = copy(self._field_of_view)
+        return other
+
+    def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
+        """Count which landmarks were in view of an observation, already used, and which were seen.
+
+        Some of its points came without an id. Unless others have one (``some_have_ids``), which
+        show better where the robot is, the pose is counted as unexpected if none of the landmarks
+        in view was seen for so long that it is no chance any more. Landmarks that were seen too
+        seldom while in view are forgotten; landmarks out of view never: one may be the only tie
+        to an older part of the map. Return −2 ln of the probability that confirmed landmarks in
+        view were missed.
+        """
+        # What should have been seen, and was.
+        landmarks = state.landmarks
+        is_numbered, everything = is_automatic(landmarks.ids), np.arange(len(landmarks))
+        seen = landmarks.last_seen_ns == event.stamp_ns
+        in_view = seen | self._field_of_view.contains(state.observer.body_points(everything))
+        if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
+            state.counts['unexpected_place'] += 1
+        # Those without an id of their own: what it costs to have missed them, and their counts.
+        rows = np.flatnonzero(is_numbered & in_view)
+        cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
+        self.missed = self._missed(in_view & ~landmarks.tentative, seen)
+        landmarks.note_in_view(rows, seen[rows], self._has_moved(state))
+        if not some_have_ids:  # landmarks of a loaded map, by their ids
+            landmarks.note_missed(np.flatnonzero(~is_numbered & in_view), seen)
+        self._field_of_view.include(event.points)
+        # Landmarks seen too seldom, and landmarks that were confirmed.
+        were_tentative = np.count_nonzero(landmarks.tentative)
+        unsupported = landmarks.unsupported(state.settings.min_support)
+        self.confirmed_now = int(were_tentative - np.count_nonzero(landmarks.tentative))
+        state.forget(unsupported, Change.UNSUPPORTED, event.stamp_ns)
+        return cost
+
+    def _has_moved(self, state: State) -> bool:
+        """Return whether the robot is at another place than when it last was at another one."""
+        A, last = state.observer.A, self._last_place
+        if last is not None:
+            motion = se3.inverse(last) @ A
+            turn = 0.5 * (motion[:3, :3] - motion[:3, :3].T)
+            if max(np.abs(motion[:3, 3]).max(), np.abs(turn).max()) < MOVED_M:
+                return False
+        self._last_place = A.copy()
+        return True
+
+    def _missed(self, in_view: BoolArray, seen: BoolArray) -> float:
+        """Return how many landmarks (n,) in view should have been seen, and were not."""
+        if not self._field_of_view.is_known:
+            return 0.0
+        share = self._seen / self._in_view
+        self._in_view += int(np.count_nonzero(in_view))
+        self._seen += int(np.count_nonzero(in_view & seen))
+        return share * int(np.count_nonzero(in_view & ~seen))
+
+    def _cost(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
+        """Return the cost of confirmed landmarks (u,) in view that were missed once more.
+
+        The rate at which one in view is seen differs between landmarks and poses. Where it is
+        exponentially distributed about its mean p, one is missed k times in a row with the
+        probability 1/(1 + k p): one that is hidden soon costs little more.
+        """
+        if not self._field_of_view.is_known:
+            return 0.0
+        p, missed = landmarks.likely_share, landmarks.missed[unseen]
+        return 2.0 * float(np.sum(np.log1p(p / (1.0 + missed * p))))
+
+    def _add_evidence(
+        self,
+        landmarks: LandmarkTable,
+        event: ObservationEvent,
+        in_view: BoolArray,
+        seen: BoolArray,
+    ) -> bool:
+        """Count landmarks (n,) in view that were missed; return whether too many, too long."""
+        numbers = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
+        old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)
+        if (old & seen).any():
+            self._evidence = 0.0
+        elif len(event.points) and self._field_of_view.is_known:
+            evidence = -math.log1p(-landmarks.likely_share) * int(np.sum(old))
+            self._evidence += min(evidence, MAX_EVIDENCE)
+        is_unexpected = self._evidence > IMPROBABLE
+        if is_unexpected or self._evidence == 0.0:
+            self._evidence = 0.0
+            self._newest_number = int(np.max(numbers, initial=0))
+        return is_unexpected
+
+
+@dataclass(slots=True, eq=False)
+class Hypothesis:
+    """A state, with the helpers for points without an id."""
+
+    state: State
+    visibility: Visibility  # the view of a sensor that gives no ids
+    index: LandmarkIndex = field(default_factory=LandmarkIndex)
+    cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
+
+    @classmethod
+    def of(cls, state: State) -> Hypothesis:
+        """Return the only hypothesis there is."""
+        return cls(state, Visibility(state.axes.point))
+
+    def with_state(self, state: State) -> Hypothesis:
+        """Return another hypothesis, which has had the same landmarks in view."""
+        return Hypothesis(state, self.visibility.copy(), copy(self.index), self.cost)
+
+    def copy(self) -> Hypothesis:
+        """Return an independent copy."""
+        return self.with_state(self.state.copy())

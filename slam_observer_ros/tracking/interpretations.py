@@ -1,0 +1,212 @@
+"""What an observation may mean: points without an id, and wheels that may have slipped.
+
+An observation that the gate mostly rejects has several interpretations. It is garbled, its
+landmarks have moved, or the robot is not where odometry has it: its wheels slipped, or someone
+carried it. A robot that ignored what it sees would then be lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, IntArray, is_automatic
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.filter.observer import Residuals
+from slam_observer_ros.filter.robust import accepted
+from slam_observer_ros.lie.matrices import mahalanobis
+from slam_observer_ros.models.motion_noise import beyond_driving
+from slam_observer_ros.tracking.assignments import Assignment, find_assignments
+from slam_observer_ros.tracking.costs import (
+    outlier_cost,
+    pairing_cost,
+    rejection_cost,
+    SLIP_COST,
+)
+from slam_observer_ros.tracking.hypothesis import LandmarkIndex
+from slam_observer_ros.tracking.joint_compatibility import joint_cost
+from slam_observer_ros.tracking.matching import (
+    Expected,
+    is_contradiction,
+    match,
+    MatchedObservation,
+)
+from slam_observer_ros.tracking.slip import astray, slip
+from slam_observer_ros.tracking.state import State
+
+
+def _none() -> IntArray:
+    return np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Interpretation:
+    """One of the meanings that an observation may have: a landmark or none for each point."""
+
+    event: ObservationEvent  # all ids filled in
+    cost: float  # −2 ln of its likelihood, without what all interpretations share
+    slipped: State | None = None  # the state, if the robot moved in any way since the last one
+    # (j,) landmarks that had no id of their own so far, and the ids that they get.
+    named_rows: IntArray = field(default_factory=_none)
+    given_ids: IntArray = field(default_factory=_none)
+    matched: MatchedObservation | None = None  # with the landmarks of these ids, where it is so
+    update: Update | None = None  # where the state has already used it so
+
+
+def interpretations(
+    state: State,
+    index: LandmarkIndex,
+    event: ObservationEvent,
+    matched: MatchedObservation,
+    new_ids: IntArray,
+    new_cost: float,
+    budget: float,
+    is_alone: bool = False,
+) -> list[Interpretation]:
+    """Return what an observation may mean.
+
+    ``state`` is at its instant, ``index`` has its landmarks, ``matched`` is the observation
+    with the landmarks that its ids name. Points taken for landmarks not seen before get
+    ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
+    Interpretations that cost more than ``budget`` need not be returned. Where there is no other
+    state, ``is_alone``, costs are compared with each other only.
+    """
+    some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
+    if not some_are_unknown:
+        rejected = _are_rejected(state, matched.residuals)
+        if is_contradiction(rejected):
+            return _rejected_or_slipped(state, matched, event, rejected)
+    if some_are_unknown or may_name(state, matched):
+        found = find_assignments(state, index, event, new_cost, budget, is_alone)
+        possible = [_with_ids(state, event, assignment, new_ids) for assignment in found]
+        # In a loaded map a robot that is elsewhere is sought anywhere.
+        is_own = bool(is_automatic(state.landmarks.ids).all())
+        if is_own and (event.ids == UNKNOWN_ID).all():
+            possible += _slips_without_ids(state, index, event, new_ids, new_cost, found)
+        return possible
+    cost = pairing_cost(state, len(event.ids), matched.residuals)
+    return [Interpretation(event, cost, matched=matched)]
+
+
+def as_its_ids_say(
+    state: State, event: ObservationEvent, update: Update, expected: Expected | None
+) -> Interpretation:
+    """Return the only meaning of an observation that a state has used as usual."""
+    m = len(event.ids)
+    cost = m * outlier_cost(state)
+    if expected is not None:
+        paired_cost = joint_cost(expected.r, expected.S, expected.R)
+        cost = paired_cost + (m - len(expected.r)) * outlier_cost(state)
+    return Interpretation(event, cost, update=update)
+
+
+def is_contradicted(state: State, matched: MatchedObservation) -> bool:
+    """Return whether the gate rejects most points: then the robot may have slipped."""
+    residuals = matched.residuals
+    if accepted(mahalanobis(*residuals.on(state.axes)), state.settings.rejection_threshold).all():
+        return False  # by all of S they are no further off
+    return is_contradiction(_are_rejected(state, residuals))
+
+
+def may_name(state: State, matched: MatchedObservation) -> bool:
+    """Return whether a point's id may belong to a landmark which had no id so far."""
+    all_are_known = len(matched.known.ids) == len(matched.rows) + len(matched.left_out)
+    if all_are_known:
+        return False
+    return bool(is_automatic(state.landmarks.ids).any())
+
+
+def _rejected_or_slipped(
+    state: State,
+    matched: MatchedObservation,
+    event: ObservationEvent,
+    rejected: BoolArray,
+) -> list[Interpretation]:
+    """Interpret an observation most of whose known landmarks are rejected.
+
+    If a single motion explains all that is seen, this is as unlikely of a garbled message as of a
+    robot that has made this motion.
+    """
+    residuals, m = matched.residuals, len(event.ids)
+    cost, is_new_cause = rejection_cost(state, matched, rejected)
+    accepted_cost = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
+    after_slip = _after_slip(state, matched, event) if is_new_cause else None
+    rejecting = Interpretation(event, accepted_cost + cost, matched=matched)
+    if after_slip is None:
+        return [rejecting]
+    if state.was_contradicted:
+        return [rejecting, after_slip]
+    as_outliers = accepted_cost + float(np.sum(rejected)) * outlier_cost(state)
+    # A garbled message also explains points that happen to be where they should be.
+    garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
+    return [replace(rejecting, cost=garbled), after_slip]
+
+
+def _after_slip(
+    state: State, matched: MatchedObservation, event: ObservationEvent
+) -> Interpretation | None:
+    """Take the robot for slipped; return None if that does not explain all of it."""
+    settings = state.settings
+    if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
+        return None
+    stands = state.observation_noise.stood_s > 0.0
+    far = beyond_driving(matched.known.points, matched.residuals.r, settings)
+    if stands and not far.all():
+        return None
+    slipped = state.copy()
+    cost = slip(slipped, matched)
+    matched = match(slipped, event)
+    if _are_rejected(slipped, matched.residuals).any():
+        return None
+    cost += SLIP_COST + pairing_cost(slipped, len(event.ids), matched.residuals)
+    return Interpretation(event, cost, slipped, matched=matched)
+
+
+def _slips_without_ids(
+    state: State,
+    index: LandmarkIndex,
+    event: ObservationEvent,
+    new_ids: IntArray,
+    new_cost: float,
+    found: list[Assignment],
+) -> list[Interpretation]:
+    """Take the robot for slipped, where more points are new than a slip is unlikely."""
+    new = min((int(np.sum(one.rows < 0)) for one in found), default=len(event.ids))
+    if new * new_cost <= SLIP_COST or not len(state.landmarks):
+        return []
+    slips: dict[bytes, Interpretation] = {}
+    for other in astray(state):
+        for assignment in find_assignments(other, index, event, new_cost, np.inf, False)[:1]:
+            is_new, taken_for = assignment.rows < 0, assignment.rows.tobytes()
+            if np.sum(is_new) >= new or taken_for in slips:
+                continue
+            taken = _with_ids(state, event, assignment, new_ids).event
+            slipped = _after_slip(state, match(state, taken), taken)
+            if slipped is not None:
+                spared = np.sum(is_new) * (outlier_cost(state) - new_cost)
+                slips[taken_for] = replace(slipped, cost=slipped.cost - float(spared))
+    return list(slips.values())
+
+
+def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
+    """Return which points (m,) the gate rejects."""
+    gate = state.settings.rejection_threshold
+    return ~accepted(state.gains.distances(residuals), gate)
+
+
+def _with_ids(
+    state: State, event: ObservationEvent, assignment: Assignment, new_ids: IntArray
+) -> Interpretation:
+    """Interpret m points as an assignment has them; ``new_ids`` (m,) are for new landmarks."""
+    rows, has_id = assignment.rows, event.ids != UNKNOWN_ID
+    known_ids = np.append(state.landmarks.ids, UNKNOWN_ID)[rows]
+    ids = np.where(has_id, event.ids, np.where(rows < 0, new_ids, known_ids))
+    is_named = has_id & (rows >= 0) & (known_ids != event.ids)
+    return Interpretation(
+        replace(event, ids=ids),
+        assignment.cost,
+        named_rows=rows[is_named],
+        given_ids=event.ids[is_named],
+    )

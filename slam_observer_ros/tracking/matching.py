@@ -1,0 +1,251 @@
+"""Matching an observation with a state: which landmarks it is of, residuals, their noise.
+
+And what a filter expects residuals to be, and how far off they are by that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import Change, NormalisedInnovation, Reason
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.filter.arrays import SeenOrientations
+from slam_observer_ros.filter.gains import Gains
+from slam_observer_ros.filter.observer import Residuals
+from slam_observer_ros.filter.step import LOG_ROOT_2_PI
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.matrices import cholesky, diagonal_blocks, mahalanobis
+from slam_observer_ros.models import sensing
+from slam_observer_ros.models.motion_noise import beyond_driving
+from slam_observer_ros.models.observation_noise import RESOLUTION_M
+from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.tracking.state import State
+
+SAME_POSITION = 4.0
+"""Rejections within this many standard deviations of each other are at one position."""
+
+
+@dataclass(frozen=True, slots=True)
+class MatchedObservation:
+    """An observation, with the landmarks of a state that its points are of."""
+
+    event: ObservationEvent  # where mapping is over, without points of unknown landmarks
+    rows: IntArray  # (m,) row of each point's landmark, −1 where it is new
+    covariances: FloatArray  # (m, 3, 3) of the points, body frame, m²
+    known: ObservationEvent  # the points of known landmarks …
+    residuals: Residuals  # … and theirs
+    left_out: IntArray  # ids of the observation's points that are not in ``event``
+
+
+def match(state: State, event: ObservationEvent) -> MatchedObservation:
+    """Match an observation made at the state's instant with landmarks by their ids."""
+    event = calibrated(state, event)
+    rows, left_out = state.landmarks.rows_of(event.ids), event.ids[:0]
+    if not state.is_mapping:
+        left_out = event.ids[rows < 0]
+        event, rows = mapped(state, event)
+    is_known = rows >= 0
+    state.gains.activate(rows[is_known])  # before anything is asked of them
+    covariances = point_covariances(state, event, rows)
+    if np.count_nonzero(is_known) == len(rows):  # as nearly always
+        residuals = residuals_of(state, event, rows, covariances)
+        return MatchedObservation(event, rows, covariances, event, residuals, left_out)
+    known = event.select(is_known)
+    residuals = residuals_of(state, known, rows[is_known], covariances[is_known])
+    return MatchedObservation(event, rows, covariances, known, residuals, left_out)
+
+
+def calibrated(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation by the calibration of its sensor, if it is not so yet."""
+    calibration = state.calibration
+    if not calibration.corrects_points or event.sensed is not None:
+        return event
+    if event.sensor_frame not in calibration.sensors:
+        state.add_sensor(event.sensor_frame)
+    return sensing.calibrated(calibration, state.settings, event)
+
+
+def calibrated_again(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation by the present calibration, which a correction has changed."""
+    return sensing.calibrated_again(state.calibration, event)
+
+
+def sensitivity(
+    state: State, event: ObservationEvent, points: FloatArray | None = None
+) -> FloatArray | None:
+    """Return R̂ D_i (m, 3, c) at ``points`` (m, 3), body frame, or where an observation has them.
+
+    None where nothing of a sensor is estimated.
+    """
+    points = event.points if points is None else points
+    D = sensing.point_sensitivity(state.calibration, event, points)
+    return None if D is None else state.observer.A[:3, :3] @ D
+
+
+def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
+    """Return the points of known landmarks in an observation, and their rows."""
+    rows = state.landmarks.rows_of(event.ids)
+    is_known = rows >= 0
+    return event.select(is_known), rows[is_known]
+
+
+def enter(state: State, event: ObservationEvent, noise: FloatArray) -> None:
+    """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
+    limit, new = state.settings.max_landmarks, len(event.ids)
+    m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
+    state.counts.note(Reason.UNMAPPED, event.ids[m:], event.stamp_ns)
+    if m:
+        event = calibrated_again(state, event.select(np.arange(new) < m))
+        state.gains.add(event.points, noise[:m], sensitivity(state, event))
+        state.landmarks.add(event.ids, event.stamp_ns)
+        state.counts.note(Change.FOUND, event.ids, event.stamp_ns)
+
+
+def residuals_of(
+    state: State, event: ObservationEvent, rows: IntArray, covariances: FloatArray
+) -> Residuals:
+    """Return the residuals (29) of landmarks ``rows`` (m,) seen with ``covariances``, m²."""
+    dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    D = None
+    if event.sensed is not None:
+        D = sensitivity(state, event, state.observer.body_points(rows))
+    repeated = state.observation_noise.repetitions(dt_s)
+    return state.gains.residuals(rows, event.points, covariances, dt_s, repeated, D)
+
+
+def keyframe_of(
+    state: State,
+    event: ObservationEvent,
+    rows: IntArray,
+    orientations: SeenOrientations | None = None,
+) -> Keyframe:
+    """Return an observation, after its correction, as it is kept to be linearised again."""
+    lines_of_sight, noise = _lines_of_sight(state, event, rows), state.observation_noise
+    is_stated = event.covariances is not None
+    stated = noise.covariances(event, lines_of_sight) if is_stated else None
+    repeated = noise.repetitions(state.landmarks.unseen_s(rows, event.stamp_ns))
+    return Keyframe(
+        event.stamp_ns,
+        rows,
+        event.points,
+        lines_of_sight,
+        stated,
+        repeated,
+        orientations,
+        event.sensed,
+    )
+
+
+def reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray) -> None:
+    """Count points (m,) that were rejected, off by r (m, 3), against their landmarks.
+
+    But not what is off by the sensor's lasting error, while the robot stands: that is no news.
+    """
+    state.counts.note(Reason.REJECTED, event.ids, event.stamp_ns)
+    if state.observation_noise.stood_s > 0.0:
+        far = beyond_driving(event.points, r, state.settings)
+        event, rows = event.select(far), rows[far]
+    state.landmarks.reject(rows, *positions(state, event))
+
+
+def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
+    """Return where points seem to be (m, 3), reference frame, and tolerances (m,), metres.
+
+    By their own noise: a landmark's own uncertainty may be much less.
+    """
+    spread_m = np.sqrt(np.trace(state.observation_noise.covariances(event), axis1=1, axis2=2))
+    return se3.transform(state.observer.A, event.points), SAME_POSITION * spread_m
+
+
+def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    """Return the covariances (m, 3, 3) of points of landmarks ``rows``, −1 if new, body frame, m².
+
+    The noise model is given the range at which a landmark should be, not the measured one: a range
+    measured short would be trusted more than one measured long, and all would be drawn towards
+    the robot. The bearing is the measured one: the sensor knows it better than a state whose
+    heading is yet to be corrected.
+    """
+    measured, expected = event.lines_of_sight, _lines_of_sight(state, event, rows)
+    expected_squared = np.einsum('ij,ij->i', expected, expected)
+    measured_squared = np.einsum('ij,ij->i', measured, measured)
+    shares = np.sqrt(expected_squared / np.maximum(measured_squared, RESOLUTION_M**2))
+    return state.observation_noise.covariances(event, shares[:, None] * measured)
+
+
+def rejected_before(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
+    """Return which known landmarks (m,) were rejected before where they are seen now.
+
+    Return how far (m, 3) all of them are from where they were rejected last, too: metres,
+    reference frame.
+    """
+    rows = matched.residuals.rows
+    points, tolerances_m = positions(state, matched.known)
+    again = state.landmarks.are_rejected_again(rows, points, tolerances_m)
+    return again, points - state.landmarks.rejected_last[rows]
+
+
+def is_contradiction(rejected: BoolArray) -> bool:
+    """Return whether most of the known landmarks (m,) seen are rejected: the pose may be wrong."""
+    return bool(2 * np.count_nonzero(rejected) > len(rejected))
+
+
+def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    """Return where points should be (m, 3), from the sensor, metres, body frame."""
+    landmarks, settings = state.landmarks, state.settings
+    if not len(landmarks):
+        return event.lines_of_sight
+    # A new or doubtful landmark, and one that may be an outlier, is where it was measured.
+    is_confirmed = landmarks.counts.take(rows, mode='wrap') >= settings.confirmations
+    in_doubt = landmarks.in_doubt(rows, settings.max_rejections)
+    is_sure = (rows >= 0) & is_confirmed & ~in_doubt
+    points = state.observer.body_points(rows)
+    if np.count_nonzero(is_sure) < len(rows):
+        points = np.where(is_sure[:, None], points, event.points)
+    return points if event.sensor is None else points - event.sensor
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Residuals of m points before a correction, metres, and what was expected of them."""
+
+    r: FloatArray  # (m, k)
+    distances: FloatArray  # (m,) Mahalanobis distance of each
+    R: FloatArray  # (m, k, k) the part of their covariance that comes from the points, m²
+    S: FloatArray  # (m k, m k) their joint covariance, m²; empty if it is not known
+
+    @classmethod
+    def of(cls, gains: Gains, residuals: Residuals) -> Expected:
+        """Ask gains, before they correct the state."""
+        r, R = residuals.on(gains.axes)
+        if not len(r):
+            return cls(r, np.empty(0), R, np.empty((0, 0)))
+        if len(S := gains.innovation_covariance(residuals)):
+            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), R, S)
+        return cls(r, gains.distances(residuals), R, S)
+
+    def judge(self, weights: FloatArray, shares: FloatArray) -> NormalisedInnovation:
+        """Return how far off the residuals are, given the weights (m,) of the correction.
+
+        ``shares`` (m,) is what each is worth of an observation with new errors.
+        """
+        (m, k), used = self.r.shape, weights > 0.0
+        nis, log_densities = None, np.full(m, -np.inf)
+        if len(self.S) and used.any():
+            rows = np.flatnonzero(np.repeat(used, k))
+            L = cholesky(self.S[np.ix_(rows, rows)])
+            # One after the other, each as those before it have it: the product is that of all.
+            white = np.linalg.solve(L, self.r.ravel()[rows])
+            nis = float(white @ white)
+            each = 0.5 * white**2 + np.log(np.diagonal(L)) + LOG_ROOT_2_PI
+            log_densities[used] = -each.reshape(-1, k).sum(axis=1)
+        return NormalisedInnovation(
+            self.distances,
+            weights,
+            nis,
+            0 if nis is None else k * int(np.count_nonzero(used)),
+            log_densities,
+            shares,
+        )

@@ -1,0 +1,300 @@
+"""One hypothesis of pose and map: gains, errors, landmarks and history."""
+
+from __future__ import annotations
+
+from copy import copy
+
+import numpy as np
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import Change, NormalisedInnovation, Outcomes, Smoothed, Update
+from slam_observer_ros.filter.gains import Errors, Gains
+from slam_observer_ros.filter.known_landmarks import KnownLandmarks
+from slam_observer_ros.filter.observer import lyapunov
+from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.matrices import correlations_of
+from slam_observer_ros.models.integration import integrate, integrate_until
+from slam_observer_ros.models.motion import Motion, Passage
+from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
+from slam_observer_ros.tracking import covariances
+
+OLD_NEWS = 10.0
+"""By what factor covariances of views have grown, while a robot stands, that are not kept."""
+
+
+class State:
+    """Pose and map as of one instant; :mod:`.step` moves it on."""
+
+    def __init__(self, gains: Gains, settings: Settings) -> None:
+        self.settings = settings  # those in force
+        self.judges_innovations = False  # which takes time, and is for those who look at them
+        self.is_mapping = True  # landmarks are added, and relocated if rejected too often
+        self.gains, self.errors = gains, gains.errors  # they move X̂, and know its errors or not
+        self.observer, self.axes = gains.observer, gains.axes
+        self.calibration, self.motion_noise = gains.calibration, gains.motion_noise
+        self.landmarks = self.observer.landmarks
+        # How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it.
+        is_ignored = 'landmark_velocity_stddev' in gains.ignores
+        self.landmark_velocity_stddev = 0.0 if is_ignored else settings.landmark_velocity_stddev
+        self.relinearisation = Past()
+        if self.errors is not None and not self.landmark_velocity_stddev:
+            self.relinearisation = Relinearisation(self.errors, self.calibration, settings)
+        self.counts = Outcomes()  # landmarks rejected, moved, forgotten and so on
+        self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
+        self.was_contradicted = False  # most known landmarks seen last were rejected
+        self.observation_noise = ObservationNoise(settings)
+        # Around the state's stamp, as the last motion had it; the next one begins with the same.
+        self.end_velocity: FloatArray | None = None
+
+    def copy(self) -> State:
+        """Return an independent copy: one copy of memory an array."""
+        other = copy(self)
+        other.gains = gains = self.gains.copy()
+        other.observer, other.errors = gains.observer, gains.errors
+        other.calibration, other.motion_noise = gains.calibration, gains.motion_noise
+        other.landmarks, other.counts = gains.observer.landmarks, self.counts.copy()
+        other.relinearisation = self.relinearisation.copy(other)
+        return other
+
+    @property
+    def known_errors(self) -> Errors:
+        """The errors, for association, which only gains that know them have."""
+        if self.errors is None:
+            raise TypeError('these gains know no joint covariance')
+        return self.errors
+
+    @property
+    def confirmed(self) -> IntArray:
+        """Rows of the landmarks seen often enough to be in the map.
+
+        One seen once or twice may still be an outlier, and one without an id a false point for
+        longer; it helps to estimate the pose, but is not published.
+        """
+        often = self.landmarks.counts >= self.settings.confirmations
+        return np.flatnonzero(often & ~self.landmarks.tentative)
+
+    def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:
+        """Return those (n, 3, 3) of landmarks after ``duration_s``, world, m²; or None."""
+        if self.errors is None:
+            return None
+        return covariances.of_landmarks(
+            self.observer, self.errors.landmark_covariances(duration_s)
+        )
+
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
+
+        None in an exact map, or where gains know none.
+        """
+        if (P := self.gains.joint_covariance(rows)) is None:
+            return None
+        return covariances.of_configuration(self.observer, self.axes, rows, P)
+
+    def pose_after(
+        self, velocities: VelocityHistory, start_ns: int, end_ns: int
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the pose (4, 4) at ``end_ns``, body to world, and its covariance (6, 6).
+
+        Of its rotation vector and position, along the world's axes, rad² and m²; None if unknown.
+        """
+        motion = self.motion(velocities, start_ns, end_ns)
+        A = motion.path[-1]
+        return self.observer.reference_pose @ A, self._pose_covariance(motion, A)
+
+    def poses_until(
+        self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then."""
+        passage = self.passage(velocities, start_ns, stamps_ns, with_covariances=True)
+        A = passage.poses
+        return self.observer.reference_pose @ A, self._pose_covariance(passage, A)
+
+    def _pose_covariance(self, motion: Motion | Passage, A: FloatArray) -> FloatArray | None:
+        if self.errors is None:
+            return None
+        return covariances.of_pose(self.observer, self.errors.pose_covariance(motion), A)
+
+    def passage(
+        self,
+        velocities: VelocityHistory,
+        start_ns: int,
+        stamps_ns: IntArray,
+        with_covariances: bool,
+    ) -> Passage:
+        """Return how the robot moves from the state's stamp through ``stamps_ns`` (s,)."""
+        return integrate_until(
+            velocities,
+            self.calibration,
+            self.motion_noise,
+            self.observer.A,
+            start_ns,
+            stamps_ns,
+            self.end_velocity,
+            with_covariances,
+        )
+
+    def motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
+        """Return how the robot moves from the state's stamp ``start_ns`` to ``end_ns``."""
+        return integrate(
+            velocities,
+            self.calibration,
+            self.motion_noise,
+            self.observer.A,
+            start_ns,
+            end_ns,
+            self.end_velocity,
+        )
+
+    def propagate(self, motion: Motion) -> None:
+        """Move on along a motion (27)."""
+        self.gains.advance(motion)
+        self.relinearisation.move(motion)
+        if motion.at_ends is not None:
+            self.end_velocity = motion.at_ends[1]
+
+    def slip(self, after: FloatArray, covariance: FloatArray) -> None:
+        """Let the robot be at Â = ``after`` (4, 4), by a motion that odometry has not seen.
+
+        Its ``covariance`` (6, 6) is in the body frame there, rad² and m².
+        """
+        motion = Motion(
+            path=np.array([self.observer.A, after, after]),
+            measured_velocities=np.zeros((2, 6)),
+            dt_s=np.zeros(2),
+            covariances=np.array([np.zeros((6, 6)), covariance]),
+            duration_s=0.0,
+            at_ends=None,
+            calibration=self.calibration,
+            is_slip=True,
+        )
+        self.propagate(motion)
+
+    def update(
+        self,
+        stamp_ns: int,
+        ids: IntArray,
+        r: FloatArray,
+        rejected: BoolArray,
+        moved_ids: IntArray,
+        innovation: NormalisedInnovation | None,
+    ) -> Update:
+        """Return what an observation of m landmarks has done, given residuals r (m, 3) before."""
+        observer = self.observer
+        return Update(
+            stamp_ns,
+            observer.pose,
+            ids,
+            se3.rotate(observer.reference_pose, r),
+            rejected,
+            lyapunov(self.settings.gain_k, r),
+            moved_ids,
+            innovation,
+        )
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
+        """Move the robot to ``pose`` (4, 4), body to world, uncorrelated with the map from now on.
+
+        ``covariance`` (6, 6) is as of :meth:`pose_after`; None for an exact pose.
+        """
+        observer = self.observer
+        if not len(self.landmarks):
+            # Else ε would turn about an origin that may be kilometres away.
+            observer.set_reference_pose(pose)
+        A = se3.inverse(observer.reference_pose) @ pose
+        observer.set_pose(A)
+        given = np.zeros((6, 6)) if covariance is None else covariance
+        self.gains.set_pose(A, covariances.of_pose_error(observer, given))
+        self.was_contradicted = False
+        self.forget_past('the pose was set')
+
+    def clear_time(self) -> None:
+        """Go on from here at any other time; what was seen before is not relinearised."""
+        self.end_velocity = None
+        self.was_contradicted = False
+        self.landmarks.clear_time()
+        self.forget_past('the clock jumped')
+
+    def forget_past(self, since: str) -> None:
+        """Relinearise nothing of what was seen until now; ``since`` says what has happened."""
+        self.relinearisation.reset(since)
+
+    def add_sensor(self, frame: str) -> None:
+        """Begin to calibrate the sensor of another frame."""
+        self.gains.add_sensor(frame)
+        self.relinearisation.add_calibration()
+
+    def relocate(
+        self, rows: IntArray, points: FloatArray, covariances: FloatArray, D: FloatArray | None
+    ) -> None:
+        """Take landmarks (m,) for new ones: :meth:`.Gains.relocate`."""
+        self.gains.relocate(rows, points, covariances, D)
+        self.relinearisation.relocate(rows)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``; those behind move up."""
+        self.relinearisation.remove(rows)
+        self.gains.remove(rows)
+
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: :meth:`.Gains.merge`."""
+        ids = self.landmarks.ids[copies]  # which go
+        square = self.gains.merge(rows, copies, most)
+        if square <= most:
+            self.relinearisation.merge(rows, copies)
+            self.counts.note(Change.MERGED, ids, int(self.landmarks.last_seen_ns.max()))
+        return square
+
+    def forget(self, rows: IntArray, why: Change, stamp_ns: int) -> None:
+        """Remove landmarks, if there are any at ``rows``, and count them."""
+        if len(rows):
+            self.counts.note(why, self.landmarks.ids[rows], stamp_ns)
+            self.remove(rows)
+
+    def fix_landmarks(self, known: KnownLandmarks) -> None:
+        """Take all landmarks for exact and at rest where a map has them."""
+        self.gains.fix_landmarks(known)
+        self.landmark_velocity_stddev = 0.0
+        self.relinearisation = Past()  # there is no drift to undo
+
+    def keep(self, keyframe: Keyframe, in_doubt: bool = False) -> None:
+        """Keep an observation to be linearised again, but none more of a robot that is parked.
+
+        They would say nothing more, and take the place of the drive's observations.
+        """
+        stands = self.observation_noise.stood_s > 0.0
+        if stands and not in_doubt and keyframe.repeated.min(initial=np.inf) > OLD_NEWS:
+            self.counts['parked_observation'] += 1
+        else:
+            self.relinearisation.add(keyframe, in_doubt)
+
+    def smooth(self) -> Smoothed:
+        """Return the smoothed trajectory and map; see :meth:`.Relinearisation.smooth`."""
+        if self.observer.is_exact:
+            raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
+        if self.landmark_velocity_stddev:
+            raise ParameterError(
+                "smoothing takes landmarks to rest: 'landmark_velocity_stddev' must be 0"
+            )
+        # From the reference frame to the world.
+        (step, slips, history), rows = self.relinearisation.smooth(), self.confirmed
+        found, calibration = step.end, self.calibration
+        entries = slice(self.axes.p, self.axes.p + calibration.count)
+        covariance = step.marginal()[entries, entries]
+        values = calibration.shifted(found.calibrations[-1] - calibration.values)
+        P = self.observer.reference_pose
+        return Smoothed(
+            stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
+            poses=P @ found.poses[1:],
+            world_points=se3.transform(P, found.points[rows]),
+            ids=self.landmarks.ids[rows],
+            since=history.since,
+            slips=slips,
+            orientations=P[:3, :3] @ found.orientations[rows],
+            calibration=calibration.estimates(np.diagonal(covariance), values),
+            calibration_correlations=correlations_of(covariance),
+        )

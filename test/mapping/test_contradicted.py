@@ -1,0 +1,84 @@
+"""All that is seen of a map that does not change contradicts the pose, however little it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.settings.estimator_settings import Settings
+
+SECOND, PERIOD_NS = 10**9, 50_000_000
+POINTS = np.array([[4.0, 0.3, 0.2], [3.0, -1.0, 0.3], [3.0, 1.5, 0.4], [-2.0, 1.0, 0.1]])
+V = np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
+
+
+class Robot:
+    """Drives in a map; wheels or hands may move it otherwise, and landmarks may be moved."""
+
+    def __init__(self, mode='fixed'):
+        settings = Settings(
+            reorder_window=0.0,
+            localization_mode=mode,
+            observation_model='cartesian',
+            point_noise=0.03,
+        )
+        self.estimator, self.rng = Estimator(settings), np.random.default_rng(0)
+        counts, covariances = np.zeros(4, dtype=np.int64), np.tile(1e-4 * np.eye(3), (4, 1, 1))
+        known = LandmarkMap(np.arange(4), POINTS, covariances, counts)
+        self.estimator.load_map(known, np.eye(4), 1e-4 * np.eye(6))
+        self.A, self.stamp_ns, self.points = np.eye(4), 0, POINTS.copy()
+        self.said = []
+
+    def run(self, seconds, rows, true=V):
+        """Go on, by odometry with V, and in truth otherwise; note what was said at each view."""
+        for step in range(round(seconds * SECOND / PERIOD_NS)):
+            self.estimator.add(VelocityEvent(self.stamp_ns, V))
+            self.A = self.A @ se3.exp(PERIOD_NS / SECOND * true)
+            self.stamp_ns += PERIOD_NS
+            if step % 2:
+                seen = se3.transform(se3.inverse(self.A), self.points[rows])
+                seen += 0.01 * self.rng.normal(size=seen.shape)
+                self.estimator.add(ObservationEvent(self.stamp_ns, np.array(rows), seen))
+                self.said.append(self.estimator.is_contradicted)
+
+
+@pytest.mark.parametrize('mode', ['fixed', 'uncertain'])
+@pytest.mark.parametrize('rows', [[0], [0, 1]])
+def test_a_robot_that_is_carried_away_is_contradicted_within_a_second(mode, rows):
+    robot = Robot(mode)
+    robot.run(3.0, [0, 1, 2, 3])
+    assert not any(robot.said)
+    robot.A = robot.A @ se3.pose(np.eye(3), np.array([-0.5, 2.0, 0.0]))
+    robot.said = []
+    robot.run(1.0, rows)
+    off_m = np.linalg.norm(robot.estimator.pose[:3, 3] - robot.A[:3, 3])
+    sigma_m = np.sqrt(np.trace(robot.estimator.pose_covariance[3:, 3:]))
+    assert robot.said[-1] or off_m < 5.0 * sigma_m or not robot.estimator.is_localised
+    if robot.said[-1]:
+        assert robot.estimator.counts['contradicted_pose'] == 1
+    robot.run(10.0, [0, 1, 2, 3])
+    assert not robot.said[-1]
+    assert np.linalg.norm(robot.estimator.pose[:3, 3] - robot.A[:3, 3]) < 0.1
+
+
+def test_one_garbled_message_contradicts_nothing():
+    robot = Robot()
+    robot.run(3.0, [0])
+    robot.points[0] += 2.0
+    robot.run(0.2, [0])
+    robot.points[0] -= 2.0
+    robot.run(2.0, [0])
+    assert not any(robot.said)
+
+
+def test_a_landmark_that_was_moved_beside_others_says_nothing_of_the_pose():
+    robot = Robot()
+    robot.run(2.0, [0, 1, 2, 3])
+    robot.points[0] += [0.0, 1.5, 0.0]
+    robot.run(2.0, [0, 1, 2, 3])
+    robot.run(2.0, [0])
+    assert not any(robot.said)

@@ -1,0 +1,185 @@
+"""Landmarks without ids that are one: at the end of a loop, and side by side."""
+
+from dataclasses import replace
+
+from helpers import gain_worlds
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.filter.known_landmarks import KnownLandmarks
+from slam_observer_ros.lie import se3
+from slam_observer_ros.mapping.loop_closure import LoopClosure
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.tracking.assignments import find_assignments
+from slam_observer_ros.tracking.hypothesis import LandmarkIndex
+from slam_observer_ros.tracking.state import State
+
+PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
+LOOP_NS = 100 * 10**9
+"""When the robot comes back."""
+
+SIGMA_M = 0.02
+TURN_RAD, SHIFT_M = 0.15, 1.0
+"""By how much the pose may be off by then."""
+
+
+def points_in_a_hall(seed, count=16):
+    flat = np.random.default_rng(seed).uniform(0.0, 12.0, (count, 2))
+    return np.pad(flat, ((0, 0), (0, 1)))
+
+
+def grid():
+    x, y = np.meshgrid(np.arange(4.0), np.arange(4.0))
+    return 3.0 * np.column_stack([x.ravel(), y.ravel(), np.zeros(16)])
+
+
+def after_a_loop(points, seen, seed=0):
+    """A state with old landmarks, of which it has mapped ``seen`` again after drifting."""
+    rng = np.random.default_rng(seed)
+    state = State(make_gains(PLANAR, np.eye(4)), PLANAR)
+    old = np.arange(len(points))
+    state.gains.add_known(KnownLandmarks(points, np.tile(1e-4 * np.eye(3), (len(points), 1, 1))))
+    state.landmarks.add(FIRST_AUTOMATIC_ID + old, 0)
+    true_pose = se3.from_rpy((6.0, 6.0, 0.0, 0.0, 0.0, 0.5))
+    drift = rng.normal(size=3) * [TURN_RAD, SHIFT_M, SHIFT_M]
+    pose = se3.exp(np.array([0.0, 0.0, drift[0], drift[1], drift[2], 0.0])) @ true_pose
+    covariance = np.diag(np.array([0.0, 0.0, TURN_RAD, SHIFT_M, SHIFT_M, 0.0]) ** 2)
+    state.set_pose(pose, covariance)
+    noise = SIGMA_M * np.pad(rng.normal(size=(len(seen), 2)), ((0, 0), (0, 1)))
+    body = se3.transform(se3.inverse(true_pose), points[seen]) + noise
+    state.gains.add(body, np.tile(SIGMA_M**2 * np.eye(3), (len(seen), 1, 1)))
+    state.landmarks.add(FIRST_AUTOMATIC_ID + len(points) + np.arange(len(seen)), LOOP_NS)
+    state.landmarks.counts[:] = 9
+    state.landmarks.tentative[:] = False
+    return state, true_pose
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_loop_closes_where_new_landmarks_lie_to_each_other_as_old_ones(seed):
+    points, seen = points_in_a_hall(seed), np.arange(3, 10)
+    state, true_pose = after_a_loop(points, seen, seed)
+    before = np.abs(state.observer.pose - true_pose).max()
+    assert LoopClosure().close(state, LOOP_NS + 10**9)
+    assert before > 0.1
+    assert_allclose(state.observer.pose, true_pose, atol=0.1)
+    assert state.landmarks.ids.tolist() == (FIRST_AUTOMATIC_ID + np.arange(16)).tolist()
+    assert state.landmarks.counts[seen].tolist() == [18] * len(seen)
+    assert_allclose(state.observer.points, points, atol=0.1)
+    assert state.counts['merged_landmark'] == len(seen)
+
+
+def test_no_loop_closes_where_new_landmarks_lie_as_many_old_ones_do():
+    state, _ = after_a_loop(grid(), np.array([0, 1, 2, 4, 5, 6, 8, 9, 10]))
+    assert not LoopClosure().close(state, LOOP_NS + 10**9)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_no_loop_closes_on_landmarks_that_are_others(seed):
+    state, _ = after_a_loop(points_in_a_hall(seed), np.arange(7), seed)
+    rng = np.random.default_rng(seed)
+    state.observer.y_ref[16:, :2] = state.observer.y_ref[16:, :2].mean(axis=0) + rng.uniform(
+        -5.0, 5.0, (7, 2)
+    )
+    assert not LoopClosure().close(state, LOOP_NS + 10**9)
+
+
+@pytest.mark.parametrize('seen', [4, 5])
+def test_it_takes_five_to_close_a_loop(seen):
+    state, _ = after_a_loop(points_in_a_hall(1), np.arange(seen))
+    assert LoopClosure().close(state, LOOP_NS + 10**9) == (seen >= 5)
+
+
+@pytest.mark.parametrize('new', [4, 6])
+def test_points_are_held_back_from_many_old_landmarks_while_new_ones_can_decide_later(new):
+    points = points_in_a_hall(2)
+    state, true_pose = after_a_loop(points, np.arange(new))
+    body = se3.transform(se3.inverse(true_pose), points[10:14])
+    event = ObservationEvent(LOOP_NS + 10**8, np.full(4, UNKNOWN_ID), body)
+    found = find_assignments(state, LandmarkIndex(), event, 20.0, np.inf, is_alone=True)
+    taken = {row for assignment in found for row in assignment.rows.tolist()}
+    assert (max(taken & set(range(16)), default=-1) < 0) == (new >= 5)
+
+
+def twins(apart_m):
+    """A state with landmarks all around, and two that are ``apart_m`` from each other."""
+    points = np.concatenate(
+        [points_in_a_hall(3), [[15.0, 15.0, 0.0], [15.0 + apart_m, 15.0, 0.0]]]
+    )
+    state = State(make_gains(PLANAR, np.eye(4)), PLANAR)
+    covariances = np.tile(SIGMA_M**2 * np.eye(3), (len(points), 1, 1))
+    state.gains.add_known(KnownLandmarks(points, covariances))
+    state.landmarks.add(FIRST_AUTOMATIC_ID + np.arange(len(points)), 0)
+    state.landmarks.counts[:] = 9
+    state.landmarks.tentative[:] = False
+    state.landmarks.last_seen_ns[-1] = 5
+    return state
+
+
+@pytest.mark.parametrize(('apart_m', 'merged'), [(0.02, 1), (0.3, 0)])
+def test_two_landmarks_are_one_if_they_are_as_near_each_other_as_they_are_known(apart_m, merged):
+    state = twins(apart_m)
+    assert LoopClosure().merge_twins(state) == merged
+    assert len(state.landmarks) == len(state.observer.points) == 18 - merged
+    if merged:
+        assert_allclose(state.observer.points[16], [15.01, 15.0, 0.0], atol=2e-3)
+        assert state.landmarks.counts[16] == 18
+        assert state.landmarks.last_seen_ns[16] == 5
+
+
+def test_two_landmarks_that_were_seen_at_once_side_by_side_are_two():
+    state, closure = twins(0.02), LoopClosure()
+    state.landmarks.last_seen_ns[-2:] = 7
+    closure.note(state, 7)
+    state.landmarks.last_seen_ns[-1] = 9
+    assert closure.merge_twins(state) == 0
+
+
+def test_a_false_point_beside_a_landmark_makes_it_no_two():
+    """Of two that the sensor hardly misses one would not be seen alone, again and again."""
+    state, closure = twins(0.03), LoopClosure()
+    state.landmarks.note_in_view(np.arange(18), np.ones(18, dtype=bool))
+    state.landmarks.last_seen_ns[-2:] = 7
+    closure.note(state, 7)
+    state.landmarks.last_seen_ns[-1] = 9
+    assert closure.merge_twins(state) == 1
+
+
+def test_after_a_merger_all_that_was_seen_of_both_is_smoothed_as_of_one():
+    settings = replace(PLANAR, observation_correlation_time=0.0, relinearization_interval=5)
+    world = gain_worlds.drive(settings, 30.0)
+    stamps_ns = [event.stamp_ns for event in world.observations()]
+
+    def renamed(number, event):
+        is_late = event.stamp_ns > np.median(stamps_ns)
+        return replace(event, ids=event.ids + 100 * (is_late & (event.ids < 4)))
+
+    estimator = Estimator(settings)
+    for event in world.with_observations(renamed).events:
+        assert estimator.add(event)
+    estimator.flush()
+    state, ids = estimator._hypotheses.best, np.arange(4)
+    rows, copies = state.landmarks.rows_of(ids), state.landmarks.rows_of(ids + 100)
+    both = (rows >= 0) & (copies >= 0)
+    assert both.any()
+    assert state.merge(rows[both], copies[both], 100.0) < 100.0
+    named = gain_worlds.estimate(world, settings)
+    smoothed, expected = estimator.smooth(), named.smooth()
+    assert_allclose(smoothed.poses, expected.poses, atol=1e-3)
+    assert_allclose(estimator.pose, named.pose, atol=0.02)
+
+
+def test_that_a_loop_has_closed_is_logged(caplog):
+    estimator = Estimator(PLANAR)
+    state, _ = after_a_loop(points_in_a_hall(0), np.arange(3, 10))
+    estimator._hypotheses.reset(state)
+    caplog.set_level('INFO', logger='slam_observer_ros')
+    estimator._loop_closure.follow(estimator._state, LOOP_NS + 10**9, is_alone=True)
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line == 'A loop has closed: 7 landmarks without ids were seen before.'
+    estimator._loop_closure.follow(estimator._state, LOOP_NS + 2 * 10**9, is_alone=True)
+    assert len(caplog.records) == 1

@@ -1,0 +1,154 @@
+"""Which point is of which landmark: the search for the cheapest pairing, and what each costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import itertools
+
+from hypothesis import given
+from hypothesis import strategies as st
+from nameless_points import observe, SPATIAL, stand
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.filter.robust import huber_loss
+from slam_observer_ros.tracking.costs import NewLandmarks
+from slam_observer_ros.tracking.hypothesis import LandmarkIndex
+from slam_observer_ros.tracking.interpretations import interpretations
+from slam_observer_ros.tracking.joint_compatibility import (
+    columns_of,
+    joint_cost,
+    JointSearch,
+    MAX_PARTIAL,
+    Pairs,
+)
+from slam_observer_ros.tracking.matching import match
+
+
+@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 3), st.sampled_from([2, 3]))
+def test_where_few_pairings_are_possible_the_search_finds_the_cheapest(seed, points, landmarks, k):
+    rng = np.random.default_rng(seed)
+    at, rows = np.nonzero(rng.random((points, landmarks)) < 0.8)
+    q, gate = len(at), 3.0
+    root = rng.normal(size=(q * k, q * k))
+    noise = np.tile(0.3 * np.eye(k), (q, 1, 1))
+    S = 0.2 * root @ root.T + np.kron(np.eye(q), 0.3 * np.eye(k))
+    r = rng.normal(scale=1.5, size=(q, k))
+    options = np.bincount(at, minlength=points)
+
+    def cost(chosen):
+        in_order = sorted(chosen, key=lambda i: (options[at[i]], at[i]))
+        columns = columns_of(in_order, k)
+        root = np.linalg.cholesky(S[np.ix_(columns, columns)])
+        whitened = np.linalg.solve(root, r[in_order].ravel()).reshape(-1, k)
+        log_ratio = 2 * np.sum(np.log(np.diag(root))) - len(chosen) * k * np.log(0.3)
+        unpaired = len(np.unique(at)) - len(chosen)
+        return (
+            np.sum(huber_loss(np.linalg.norm(whitened, axis=1)))
+            + log_ratio
+            + unpaired * huber_loss(gate)
+        )
+
+    possible = [
+        chosen
+        for count in range(q + 1)
+        for chosen in itertools.combinations(range(q), count)
+        if len({at[i] for i in chosen}) == len({rows[i] for i in chosen}) == count
+    ]
+    pairs = Pairs(at, rows, r, S, noise)
+    certain, unpaired_costs = np.zeros(q, dtype=bool), np.full(q, huber_loss(gate))
+    found = JointSearch(pairs, certain, unpaired_costs, np.inf).pairings()
+    least = min(cost(chosen) for chosen in possible)
+    assert found[0].cost == pytest.approx(least)
+    assert found[0].cost == pytest.approx(cost(found[0].chosen))
+    assert len(found) == min(len(possible), MAX_PARTIAL)
+    costs = [
+        pairing.cost for pairing in JointSearch(pairs, certain, unpaired_costs, 10.0).pairings()
+    ]
+    assert costs == sorted(costs)
+    assert costs[-1] <= costs[0] + 10.0
+
+
+@given(st.integers(0, 10_000), st.integers(1, 4), st.sampled_from([2, 3]))
+def test_where_each_point_may_be_of_one_landmark_all_pairs_are_what_the_search_finds(seed, q, k):
+    rng = np.random.default_rng(seed)
+    noise, root = np.tile(0.3 * np.eye(k), (q, 1, 1)), rng.normal(size=(q * k, q * k))
+    S = 0.2 * root @ root.T + np.kron(np.eye(q), 0.3 * np.eye(k))
+    pairs = Pairs(np.arange(q), np.arange(q), rng.normal(size=(q, k)), S, noise)
+    search = JointSearch(pairs, np.zeros(q, dtype=bool), np.full(q, huber_loss(2.5)), np.inf)
+    together, found = search.all_pairs(), search.pairings()
+    (same,) = [pairing for pairing in found if len(pairing.chosen) == q]
+    if together is None:  # one of them is better left out
+        z, log_diagonal = same.z.reshape(q, k), np.log(np.diag(same.L)).reshape(q, k)
+        rises = huber_loss(np.linalg.norm(z, axis=1)) - 2.0 * log_diagonal.sum(axis=1)
+        assert max(rises - k * np.log(0.3)) > huber_loss(2.5)
+        return
+    assert together.cost == pytest.approx(same.cost)
+    assert_allclose(together.z, same.z)
+    assert_allclose(together.L, same.L)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 5), st.sampled_from([2, 3]))
+def test_what_ids_cost_does_not_depend_on_the_order_of_points(seed, m, k):
+    rng = np.random.default_rng(seed)
+    root, noise = rng.normal(size=(m * k, m * k)), np.tile(0.3 * np.eye(k), (m, 1, 1))
+    S = root @ root.T + np.kron(np.eye(m), 0.3 * np.eye(k))
+    r = rng.normal(scale=5.0, size=(m, k))
+    order = rng.permutation(m)
+    columns = columns_of(order.tolist(), k)
+    turned = joint_cost(r[order], S[np.ix_(columns, columns)], noise)
+    assert joint_cost(r, S, noise) == pytest.approx(turned)
+    near = 0.1 * r / (1.0 + np.linalg.norm(np.linalg.solve(S, r.ravel())))
+    plain = near.ravel() @ np.linalg.solve(S, near.ravel())
+    log_ratio = np.linalg.slogdet(S)[1] - m * k * np.log(0.3)
+    assert joint_cost(near, S, noise) == pytest.approx(plain + log_ratio)
+
+
+def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
+    """Else states with other maps could not be compared."""
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    costs = []
+    for some_have_no_id in (False, True):
+        estimator = Estimator(SPATIAL)
+        for step in range(10):
+            stand(estimator, 0.1 * step)
+            far = [[30.0, 30.0, 0.0]] if some_have_no_id else []
+            observe(estimator, 0.1 * step, [*points, *far], [1, 2, *[UNKNOWN_ID] * len(far)])
+        new = np.array([*points, [-2.0, 2.0, 0.0]])
+        event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
+        state, index = estimator._hypotheses.best, LandmarkIndex()
+        matched = match(state, event)
+        (only,) = interpretations(state, index, event, matched, np.arange(3), 20.0, np.inf)
+        costs.append(only.cost)
+    assert costs[0] == pytest.approx(costs[1], abs=0.5)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 300), st.floats(0.01, 20.0))
+def test_the_index_misses_no_landmark_while_they_move_and_change_in_number(seed, first, radius_m):
+    rng = np.random.default_rng(seed)
+    index, landmarks = LandmarkIndex(), rng.uniform(-10.0, 10.0, (first, 3))
+    for _ in range(4):
+        points = rng.uniform(-10.0, 10.0, (3, 3))
+        radii_m = radius_m * rng.uniform(0.5, 1.0, 3)
+        found = np.zeros((3, len(landmarks)), dtype=bool)
+        found[index.near(landmarks, points, radii_m)] = True
+        distances_m = np.linalg.norm(points[:, None] - landmarks, axis=2)
+        assert found[distances_m <= radii_m[:, None]].all()
+        landmarks = landmarks + rng.normal(scale=0.05, size=landmarks.shape)
+        landmarks = np.concatenate([landmarks, rng.uniform(-10.0, 10.0, (rng.integers(9), 3))])
+        landmarks = np.delete(landmarks, rng.integers(len(landmarks)), axis=0)
+
+
+def test_on_new_ground_a_new_landmark_costs_less_and_where_all_is_known_as_much_as_the_gate():
+    new, gate_cost = NewLandmarks(), huber_loss(6.0)
+    event = ObservationEvent(0, np.full(5, UNKNOWN_ID), np.zeros((5, 3)))
+    for second in range(100):
+        new.note(replace(event, stamp_ns=second * 10**9), confirmed=1)
+    assert new.cost(gate_cost) == pytest.approx(gate_cost - 2.0 * np.log(0.2 / 0.0017), abs=0.1)
+    for second in range(100, 600):
+        new.note(replace(event, stamp_ns=second * 10**9), confirmed=0)
+    assert new.cost(gate_cost) == pytest.approx(gate_cost, abs=0.6)
+    assert new.cost(4.0) == 4.0, 'no more than a point at the gate'
