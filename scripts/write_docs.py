@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 import json
+import math
 import os
 from pathlib import Path
 import re
@@ -47,53 +48,50 @@ OF_EVERY_NODE = ('/rosout', '/parameter_events', '/clock')
 NOT_IN_TABLES = ('rcl_interfaces/', 'type_description_interfaces/', 'nav2_msgs/')
 
 INPUTS = {
-    'twist': 'the velocity of the robot in its own frame',
+    'twist': "the robot's velocity in its own frame",
     'imu': 'the angular velocity, if `use_imu` is set; `twist` then gives only the linear one',
-    'landmarks': "the landmarks seen at one instant in the sensor's frame, with ids or without",
-    'camera_info': 'of the camera whose detections have pixels alone, which are directions by it',
+    'landmarks': "landmarks at one instant in the sensor's frame, with ids or without",
+    'camera_info': 'of the camera whose detections have pixels alone',
     '/tf': 'sensor poses; `odom_frame` → `base_frame`; fiducials, if asked for',
     '/tf_static': 'sensor poses',
-    'initialpose': "where the robot was at its stamp, as RViz's *2D Pose Estimate* gives it",
+    'initialpose': "where the robot was at its stamp (RViz's *2D Pose Estimate*)",
     '~/set_pose': 'the same, for programs',
     '~/forget_landmark': 'the id of a landmark to forget',
 }
 
-TYPE_PARAMETERS = {'twist': 'velocity_type', 'landmarks': 'landmarks_type'}
-"""Inputs of several types, and the parameters that list these."""
+TYPES = {'landmarks': 'any of [Message types](#message-types)'}
+"""Types of inputs that have too many for a cell."""
 
 OUTPUTS = {
     '~/odometry': "pose in the map, calibrated velocity in the robot's frame",
     'pose': 'pose in the map with its covariance',
-    'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
-    'landmark_map': 'landmarks seen `confirmations` times or more, with ids; with covariances '
-    'where the gains know them',
-    'landmark_estimates': 'the same landmarks for tools that read PointCloud; not published if '
-    'an id is 2²⁴ or more, which its float32 channel cannot hold',
-    'markers': 'landmarks and residuals, circles for distances alone and lines for directions '
-    'alone; for the first 200 landmarks also ids and 3σ ellipsoids; '
-    'while the robot is lost in a map, arrows at the places that fit what it sees, '
-    'for RViz and Foxglove',
-    'lyapunov': 'the Lyapunov value L (34) of the last observation',
+    'path': 'at most `path_length` poses so far, 0.1 s apart or more',
+    'landmark_map': 'landmarks seen `confirmations` times or more: ids, and covariances where the '
+    'gains know them',
+    'landmark_estimates': 'the same as PointCloud; not published if an id is 2²⁴ or more, beyond '
+    'its float32',
+    'markers': 'for RViz and Foxglove: landmarks, residuals, circles for distances and lines for '
+    "directions alone, the first 200 landmarks' ids and 3σ ellipsoids; while the robot is lost in "
+    'a map, arrows at the places that fit',
+    'lyapunov': 'L (34) of the last observation',
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
     'otherwise `map_frame` → `base_frame`',
-    '~/is_localised': 'whether the pose is known, as for a behaviour tree: in the loaded map if '
-    'there is one, with standard deviations below `position_error` and `heading_error`, '
-    'and not contradicted by all that is seen',
-    '/diagnostics': 'rates, ages, what was used, what was dropped and why, '
-    'and the calibration of the velocity',
+    '~/is_localised': 'whether the pose is known, for behaviour trees: in the loaded map if there '
+    'is one, within `position_error` and `heading_error`, not contradicted by all in view',
+    '/diagnostics': "rates, ages, counts, problems, the velocity's calibration",
 }
 
 SERVICES = {
     '~/reset': 'forget the motion and what was mapped, and start again',
     '~/pause': 'hold the pose and drop what comes in',
     '~/resume': 'end the pause; the robot is where its odometry on /tf has brought it',
-    '~/save_map': 'write the map to the file that the parameter `map_path` names',
+    '~/save_map': 'write the map to `map_path`',
     '~/load_map': 'read it from there',
 }
 
 SIMULATED = {
     'twist': 'the velocity; TwistStamped with `stamped:=true`',
-    'landmarks': 'the landmarks in view; PointCloud2 with `landmarks_type:=PointCloud2`',
+    'landmarks': 'those in view; PointCloud2 with `landmarks_type:=PointCloud2`',
     'ground_truth/pose': 'the true pose in `truth_frame`',
     'ground_truth/landmarks': 'the true landmarks in `truth_frame`',
 }
@@ -203,9 +201,8 @@ def input_table(subscribed: dict[str, Topic]) -> str:
     """Return the table of what the observer takes in."""
     expect_same_names(subscribed, INPUTS)
     choices = {row.name: row.choices for row in table(ObserverNodeSettings)}
-    types = {name: topic.type_name for name, topic in subscribed.items()}
-    for name, parameter in TYPE_PARAMETERS.items():
-        types[name] = ', '.join(t for t in choices[parameter] if t not in (AUTO, 'tf'))
+    types = {name: topic.type_name for name, topic in subscribed.items()} | TYPES
+    types['twist'] = ', '.join(t for t in choices['velocity_type'] if t != AUTO)
     return markdown(
         ('topic', 'type', 'what it gives'),
         [(f'`{name}`', types[name], text) for name, text in INPUTS.items()],
@@ -214,12 +211,12 @@ def input_table(subscribed: dict[str, Topic]) -> str:
 
 def message_type_table() -> str:
     """Return the table of the message types that are read, and as what."""
-    rows = [
-        (f'`{name}`', role, known.package)
-        for role in get_args(Role)
-        for name, known in message_types(role).items()
-    ]
-    return markdown(('type', 'read as', 'published by'), rows)
+    rows: dict[tuple[str, str], list[str]] = {}
+    for role in get_args(Role):
+        for name, known in message_types(role).items():
+            rows.setdefault((role, known.package), []).append(f'`{name}`')
+    cells = [(role, package, ', '.join(names)) for (role, package), names in rows.items()]
+    return markdown(('read as', 'published by', 'types'), cells)
 
 
 def topic_table(kind: str, topics: dict[str, Topic], texts: dict[str, str]) -> str:
@@ -256,10 +253,18 @@ def two_tables(name: str, parameters: Sequence[Parameter]) -> dict[str, str]:
 def parameter_table(parameters: Iterable[Parameter]) -> str:
     """Return the table of parameters."""
     rows = [
-        (f'`{row.name}`', f'`{default_text(row)}`', row.unit, row.range_text(), description(row))
+        (f'`{row.name}`', f'`{default_text(row)}` {row.unit}'.strip(), allowed(row), text(row))
         for row in parameters
     ]
-    return markdown(('parameter', 'default', 'unit', 'range', 'what it is'), rows)
+    return markdown(('parameter', 'default', 'allowed', 'what it is'), rows)
+
+
+def allowed(row: Parameter) -> str:
+    """Return the choices, or the smallest and the largest value."""
+    if row.choices:
+        return ', '.join(row.choices)
+    ends = [f'{end:g}' if math.isfinite(end) else '' for end in (row.minimum, row.maximum)]
+    return '…'.join(ends) if any(ends) else ''
 
 
 def default_text(row: Parameter) -> str:
@@ -269,9 +274,9 @@ def default_text(row: Parameter) -> str:
     return json.dumps(row.default)
 
 
-def description(row: Parameter) -> str:
+def text(row: Parameter) -> str:
     """Return the description, and whether the value may change while the node runs."""
-    return row.description + ('' if row.read_only else ' *(may be set while running)*')
+    return row.description + ('' if row.read_only else ' *(live)*')
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

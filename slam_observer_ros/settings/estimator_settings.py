@@ -31,8 +31,7 @@ class Settings:
     )
     gain_k: float = parameter(
         4.0,
-        "Constant gains: k of the paper's (30), with metres: how fast the pose follows the "
-        'residuals',
+        'Constant gains: k of (30), with metres: how fast the pose follows residuals',
         unit='1/s',
         minimum=1e-6,
         maximum=1e6,
@@ -40,7 +39,7 @@ class Settings:
     )
     gain_l: float = parameter(
         1.0,
-        "Constant gains: l of the paper's (31); a landmark's residual decays at the rate l/k",
+        "Constant gains: l of (31); a landmark's residual decays at the rate l/k",
         unit='1/s²',
         minimum=0.0,
         maximum=1e6,
@@ -63,15 +62,15 @@ class Settings:
     )
     velocity_timeout: float = parameter(
         1.0,
-        'How long a velocity is held; after that the pose is held and flagged as stale',
+        'How long a velocity is held; then the pose is held and flagged as stale',
         unit='s',
         minimum=1e-3,
         maximum=3600.0,
     )
     reorder_window: float = parameter(
         0.05,
-        'How long events are held back to be put in stamp order, at most: after the first 10 s '
-        'twice as long as any was late in the last 10 s',
+        'How long events are held back at most, to be put in stamp order: after 10 s twice as '
+        'long as any was late in the last 10 s',
         unit='s',
         minimum=0.0,
         maximum=10.0,
@@ -79,22 +78,22 @@ class Settings:
     )
     late_limit: float = parameter(
         2.0,
-        'How late an event may come after the reorder window: an observation is carried forward, '
-        'a velocity counts from then on, unless a newer one of its kind was used before it',
+        'How late an event may come after the reorder window: an observation is carried '
+        'forward, a velocity counts from then on, unless a newer one of its kind was used',
         unit='s',
         minimum=0.0,
         maximum=60.0,
     )
     max_stamp_jump: float = parameter(
         10.0,
-        'A stamp further ahead of all others than this is refused until others confirm it',
+        'A stamp further ahead of all others is refused until others confirm it',
         unit='s',
         minimum=0.1,
         maximum=1e9,
     )
     max_linear_velocity: float = parameter(
         100.0,
-        'Greatest speed that a message is believed: beyond it the velocity is refused (too_fast)',
+        'Speed beyond which a velocity is refused (too_fast)',
         unit='m/s',
         minimum=1e-3,
         maximum=1e6,
@@ -102,8 +101,7 @@ class Settings:
     )
     max_angular_velocity: float = parameter(
         50.0,
-        'Greatest rate of turn that a message is believed: beyond it the velocity is refused '
-        '(too_fast)',
+        'Rate of turn beyond which a velocity is refused (too_fast)',
         unit='rad/s',
         minimum=1e-3,
         maximum=1e6,
@@ -111,8 +109,8 @@ class Settings:
     )
     on_time_jump: str = parameter(
         'reset',
-        'What happens when the clock jumps, as in a recording that is looped: reset forgets the '
-        'run, hold keeps pose and map',
+        'When the clock jumps, as in a looped recording: reset forgets the run, hold keeps '
+        'pose and map',
         choices=('reset', 'hold'),
     )
     angular_velocity_noise: Vector3 = parameter(
@@ -149,13 +147,13 @@ class Settings:
     )
     motion_noise_factor: str = parameter(
         'at_least_stated',
-        'Riccati gains: whether the noise of the velocity is as stated, as much more as what is '
-        'seen shows (at_least_stated), or also less (auto)',
+        "Riccati: whether the velocity's noise is as stated, as much more as what is seen "
+        'shows (at_least_stated), or also less (auto)',
         choices=('stated', 'at_least_stated', 'auto'),
     )
     unknown_angular_motion: float = parameter(
         0.5,
-        'How much the robot may turn while no velocity is known, or its wheels slip: standard '
+        'How much the robot may turn while no velocity is known or wheels slip: standard '
         'deviation after 1 s',
         unit='rad/√s',
         minimum=0.0,
@@ -163,15 +161,15 @@ class Settings:
     )
     unknown_linear_motion: float = parameter(
         0.5,
-        'How far the robot may go while no velocity is known, or its wheels slip: standard '
-        'deviation after 1 s',
+        'How far the robot may go while no velocity is known or wheels slip: standard deviation '
+        'after 1 s',
         unit='m/√s',
         minimum=0.0,
         maximum=1000.0,
     )
     observation_model: str = parameter(
         'range_bearing',
-        'Which noise figures apply to landmarks whose message has no covariance',
+        'Which noise applies to landmarks whose message has no covariance',
         choices=('range_bearing', 'cartesian', 'stereo', 'fiducial'),
         basic=True,
     )
@@ -186,7 +184,7 @@ class Settings:
     )
     range_scale_noise: float = parameter(
         0.0,
-        'Range and bearing: part of the standard deviation of the range in proportion to it',
+        'Range and bearing: standard deviation of the range in proportion to it',
         minimum=0.0,
         maximum=10.0,
     )
@@ -239,8 +237,8 @@ class Settings:
     )
     use_tag_orientation: bool = parameter(
         False,
-        'Riccati gains: whether the orientation of a tag is used, not its position alone; then '
-        "one tag in view determines the robot's heading",
+        "Riccati: whether a tag's orientation is used, too; then one tag in view gives the "
+        "robot's heading",
         basic=True,
     )
     orientation_noise: float = parameter(
@@ -254,151 +252,142 @@ class Settings:
     )
     observation_correlation_time: float = parameter(
         0.0,
-        'Riccati gains: correlation time of the error of an observed landmark, such '
-        'as that of a calibration, or of a tag seen from one side; 0 for errors that are '
-        'independent in each observation',
+        "Riccati: correlation time of a landmark's observed error, as of a calibration, or of "
+        'a tag seen from one side; 0 for independent errors',
         unit='s',
         minimum=0.0,
         maximum=60.0,
     )
     angular_scale: Vector3 = parameter(
         (1.0, 1.0, 1.0),
-        'What the angular velocity x y z is multiplied by, as for a track that is wider than the '
-        'driver knows',
+        'Factor of the angular velocity x y z, as for a track wider than the driver knows',
         minimum=0.1,
         maximum=10.0,
     )
     linear_scale: Vector3 = parameter(
         (1.0, 1.0, 1.0),
-        'What the linear velocity x y z is multiplied by, as for wheels that are larger than the '
-        'driver knows',
+        'Factor of the linear velocity x y z, as for wheels larger than the driver knows',
         minimum=0.1,
         maximum=10.0,
     )
     angular_bias: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'What is added to the angular velocity x y z after that, unless all of it is zero',
+        'Added to the angular velocity x y z after that, unless all of it is zero',
         unit='rad/s',
         minimum=-10.0,
         maximum=10.0,
     )
     linear_bias: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'What is added to the linear velocity x y z after that, unless all of it is zero',
+        'Added to the linear velocity x y z after that, unless all of it is zero',
         unit='m/s',
         minimum=-100.0,
         maximum=100.0,
     )
     velocity_delay: float = parameter(
         0.0,
-        'How much later than its stamp a velocity shows in observations; below zero where it is '
-        'stamped late',
+        'How much later than its stamp a velocity shows in observations; below zero if stamped'
+        ' late',
         unit='s',
         minimum=-MAX_DELAY_S,
         maximum=MAX_DELAY_S,
     )
     angular_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Riccati gains: scale error of the angular velocity x y z to be estimated: '
-        'its standard deviation',
+        "Riccati: standard deviation of the angular velocity's scale x y z, which is estimated",
         minimum=0.0,
         maximum=1.0,
     )
     linear_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Riccati gains: scale error of the linear velocity x y z to be estimated: '
-        'its standard deviation',
+        "Riccati: standard deviation of the linear velocity's scale x y z, which is estimated",
         minimum=0.0,
         maximum=1.0,
     )
     angular_bias_stddev: Vector3 = parameter(
         (0.005, 0.005, 0.005),
-        'Riccati gains: bias of the angular velocity x y z to be estimated: its '
-        "standard deviation; the default is that of a MEMS gyroscope's zero, or of wheels that "
-        'differ by a few thousandths; 0 for none',
+        "Riccati: standard deviation of the angular velocity's bias x y z, which is estimated;"
+        ' the default suits a MEMS gyroscope, or wheels that differ by a few thousandths; 0 '
+        'for none',
         unit='rad/s',
         minimum=0.0,
         maximum=10.0,
     )
     linear_bias_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Riccati gains: bias of the linear velocity x y z to be estimated: its standard deviation',
+        "Riccati: standard deviation of the linear velocity's bias x y z, which is estimated",
         unit='m/s',
         minimum=0.0,
         maximum=100.0,
     )
     velocity_delay_stddev: float = parameter(
         0.2,
-        'Riccati gains: delay from the stamp of a velocity to its effect in '
-        'observations, to be estimated: its standard deviation; 0 for none',
+        'Riccati: standard deviation of velocity_delay, which is estimated; 0 for none',
         unit='s',
         minimum=0.0,
         maximum=MAX_DELAY_S,
     )
     sensor_rotation_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Riccati gains: how far a sensor of landmarks may be turned against what /tf says, about '
-        'the body axes x y z, to be estimated for each sensor frame: its standard deviation; '
-        'brackets are turned by some 0.035 (2°)',
+        'Riccati: how far each landmark sensor may be turned against /tf, about the body axes '
+        'x y z, which is estimated; brackets are off by some 0.035 (2°)',
         unit='rad',
         minimum=0.0,
         maximum=1.0,
     )
     sensor_translation_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Riccati gains: how far a sensor of landmarks may be from where /tf says, along the body '
-        'axes x y z, to be estimated: its standard deviation',
+        'Riccati: how far each landmark sensor may be shifted against /tf, along the body axes'
+        ' x y z, which is estimated',
         unit='m',
         minimum=0.0,
         maximum=10.0,
     )
     range_scale: float = parameter(
         1.0,
-        "What a sensor's ranges are multiplied by, as for tags printed larger than the detector "
-        'knows, or a focal length that is off',
+        "Factor of a sensor's ranges, as for tags larger than the detector knows, or a wrong "
+        'focal length',
         minimum=0.1,
         maximum=10.0,
     )
     range_scale_stddev: float = parameter(
         0.0,
-        'Riccati gains: how far range_scale may be off, to be estimated: its standard deviation; '
-        'without a surveyed map it can hardly be distinguished from the scale of velocities',
+        'Riccati: standard deviation of range_scale, which is estimated; without a surveyed '
+        "map it can hardly be distinguished from the velocity's scale",
         minimum=0.0,
         maximum=1.0,
     )
     range_is_depth: bool = parameter(
         False,
-        'Whether the sensor takes for range what is depth along its axis, as cameras do that '
-        "judge distance by apparent size; the axis is x of the sensor's frame, z of an optical "
-        'one',
+        "Whether the sensor's range is depth along its axis, as of cameras that judge distance"
+        ' by apparent size; the axis is x of its frame, z of an optical one',
     )
     calibration_drift: float = parameter(
         0.0,
-        'Riccati gains: how fast the calibration of velocity and sensors drifts, as '
-        'a share of the standard deviation of each part',
+        'Riccati: how fast the calibration of velocity and sensors drifts, as a share of each '
+        'standard deviation',
         unit='1/√s',
         minimum=0.0,
         maximum=10.0,
     )
     landmark_velocity_stddev: float = parameter(
         0.0,
-        'Riccati gains: spread of unknown constant landmark velocities to be estimated; 0: static',
+        'Riccati: spread of constant landmark velocities, which are estimated; 0: landmarks '
+        'are static',
         unit='m/s',
         minimum=0.0,
         maximum=100.0,
     )
     huber_threshold: float = parameter(
         1.345,
-        'Riccati gains: standard deviations of noise beyond which an observation '
-        'loses weight; 0 for never',
+        'Riccati: standard deviations beyond which an observation loses weight; 0 for never',
         minimum=0.0,
         maximum=1e9,
         read_only=False,
     )
     rejection_threshold: float = parameter(
         6.0,
-        'Riccati gains: standard deviations of the residual beyond which an '
-        'observation is rejected',
+        'Riccati: standard deviations of the residual beyond which an observation is rejected',
         unit='σ',
         minimum=1.0,
         maximum=1e9,
@@ -412,8 +401,8 @@ class Settings:
     )
     max_rejections: int = parameter(
         5,
-        'Riccati gains: rejections in a row, all at one position, after which a '
-        'landmark is taken to have moved; one more than it was seen, if that is fewer',
+        'Riccati: rejections in a row, all at one position, after which a landmark has moved; '
+        'one more than it was seen, if fewer',
         minimum=1,
         maximum=1_000_000,
     )
@@ -425,68 +414,66 @@ class Settings:
     )
     max_points: int = parameter(
         100,
-        'Riccati gains: most points of one observation that are used, those of known landmarks '
-        'first, then the nearest in each direction; time grows with the cube of their number',
+        'Riccati: most points of an observation that are used, known landmarks first, then the'
+        ' nearest in each direction; time grows with the cube of their number',
         minimum=1,
         maximum=1_000_000,
     )
     min_support: int = parameter(
         5,
-        'Riccati gains, points without id: how often a landmark must be seen to be in the map; it '
-        'is deleted if still not after four times as long in view as a typical one needs',
+        'Riccati, points without id: views after which a landmark is in the map; it is deleted'
+        " if four times a typical landmark's time in view did not suffice",
         minimum=1,
         maximum=1_000_000,
     )
     max_hypotheses: int = parameter(
         8,
-        'Riccati gains, points without id, or a robot that may have slipped: most hypotheses that '
-        'are followed until it is clear which one is right; where points have no id, no more than '
-        'two',
+        'Riccati, points without id, or a robot that may have slipped: most hypotheses that '
+        'are followed; at most two where points have no id',
         minimum=1,
         maximum=1000,
     )
     relinearization_interval: int = parameter(
         20,
-        'Riccati gains: fewest new observations before relinearising; a tenth of all so far if '
-        'that is more, but at most 300; 0 for never',
+        'Riccati: fewest new observations before relinearising; a tenth of all so far if that '
+        'is more, at most 300; 0 for never',
         minimum=0,
         maximum=1_000_000_000,
     )
     relinearization_angle: float = parameter(
         0.2,
-        'Riccati gains: relinearise once attitude corrections have reached this as a root sum '
-        'square; after a single one of this size a tenth of the interval is enough',
+        'Riccati: relinearise once attitude corrections reach this as a root sum square; after'
+        ' a single one of this size a tenth of the interval is enough',
         unit='rad',
         minimum=0.0,
         maximum=1e9,
     )
     smoothing_window: int = parameter(
         3000,
-        'Riccati gains: most observations that are smoothed together; the next ones go on from '
-        'the estimate then; 0 for all together, the default of replay --smooth',
+        'Riccati: most observations smoothed together; the next ones go on from there; 0 for '
+        'all, the default of replay --smooth',
         minimum=0,
         maximum=1_000_000_000,
     )
     localization_mode: str = parameter(
         'off',
-        'What a loaded map is: off, a start from which mapping goes on; uncertain, landmarks that '
-        'are refined within their covariance (constant gains know none), with no new ones added; '
-        'fixed, exact and at rest',
+        'What a loaded map is: off, a start from which mapping goes on; uncertain, refined '
+        'within its covariance (constant gains know none), without new landmarks; fixed, exact'
+        ' and at rest',
         choices=('off', 'uncertain', 'fixed'),
         basic=True,
     )
     localization_error_probability: float = parameter(
         1e-3,
-        'Riccati gains, points without id in a loaded map: how likely the place where they fit '
-        'may be wrong',
+        'Riccati, points without id in a loaded map: how likely the place where they fit may '
+        'be wrong',
         minimum=1e-9,
         maximum=0.1,
     )
     set_initial_pose: bool = parameter(
         False,
-        'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded '
-        'map within initial_position_stddev and initial_angle_stddev, instead of localising there '
-        'by landmarks',
+        'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded'
+        ' map within the initial_…_stddev, instead of localising by landmarks',
     )
     initial_position: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -504,14 +491,14 @@ class Settings:
     )
     initial_roll: float = parameter(
         0.0,
-        'Its roll then, where it does not stand upright',
+        'Its roll at the start, where it does not stand upright',
         unit='rad',
         minimum=-6.3,
         maximum=6.3,
     )
     initial_pitch: float = parameter(
         0.0,
-        'Its pitch then',
+        'Its pitch at the start',
         unit='rad',
         minimum=-6.3,
         maximum=6.3,
@@ -525,7 +512,7 @@ class Settings:
     )
     initial_angle_stddev: float = parameter(
         0.26,
-        'In a loaded map: standard deviation of how the robot is turned, about each axis',
+        'In a loaded map: standard deviation of the turn about each axis',
         unit='rad',
         minimum=0.0,
         maximum=3.2,

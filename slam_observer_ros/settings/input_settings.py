@@ -111,12 +111,11 @@ class InputSettings:
         choices=('twist', POSE_DIFFERENCES),
     )
     use_imu: bool = parameter(
-        False, 'Whether the angular velocity comes from the Imu on imu, the linear one from twist'
+        False, 'Whether the angular velocity comes from imu, and only the linear one from twist'
     )
     landmarks_type: str = parameter(
         AUTO,
-        'Message type on landmarks; auto takes the type found on the topic, tf takes fiducials '
-        'that a detector publishes on /tf',
+        'Message type on landmarks; auto takes the type found there, tf takes fiducials on /tf',
         choices=lambda: (AUTO, *short_names('landmarks'), ON_TF),
         basic=True,
     )
@@ -125,8 +124,8 @@ class InputSettings:
     )
     image_is_rectified: bool = parameter(
         True,
-        'Whether 2D detections are pixels of the rectified image, as fiducials always are, or of '
-        "the raw one, whose distortion is taken out by the camera's CameraInfo",
+        'Whether 2D detections are pixels of the rectified image, as fiducials always are; '
+        "otherwise CameraInfo's distortion is taken out",
     )
     map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks', basic=True)
     odom_frame: str = parameter(
@@ -145,8 +144,8 @@ class InputSettings:
     )
     sensor_pose: Pose6 = parameter(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        "Pose of the landmarks' sensor in base_frame, x y z and roll pitch yaw, in place of /tf; "
-        'all zeros: from /tf',
+        "Pose of the landmarks' sensor in base_frame, x y z and roll pitch yaw; all zeros: "
+        'from /tf',
         unit='m, rad',
         minimum=-1e4,
         maximum=1e4,

@@ -14,7 +14,7 @@ class ObserverNodeSettings(InputSettings):
 
     velocity_type: str = parameter(
         AUTO,
-        'Message type on twist; auto takes the type found on the topic',
+        'Message type on twist; auto takes the type found there',
         choices=lambda: (AUTO, *short_names('velocity')),
         basic=True,
     )
@@ -25,7 +25,7 @@ class ObserverNodeSettings(InputSettings):
     )
     landmarks_qos: str = parameter(
         'best_effort',
-        'Reliability requested of landmarks; best_effort fits any publisher',
+        'Reliability requested of landmarks',
         choices=('best_effort', 'reliable'),
     )
     queue_depth: int = parameter(
@@ -33,17 +33,16 @@ class ObserverNodeSettings(InputSettings):
     )
     landmarks_max_wait: float = parameter(
         0.05,
-        'Overload: once a message on landmarks has waited longer than this to be read, only the '
-        'newest of each sensor is used, the others are dropped; velocities are all used',
+        'Overload: once a message on landmarks has waited this long, only the newest of each '
+        'sensor is used; velocities are all used',
         unit='s',
         minimum=0.0,
         maximum=60.0,
     )
     transform_tolerance: float = parameter(
         1.0,
-        'How far map_frame to odom_frame is post-dated beyond reorder_window, to hold until the '
-        'next one, on a busy machine too; others see a correction that much later, and the motion '
-        'at once, from odom_frame',
+        'How far map_frame to odom_frame is post-dated beyond reorder_window, to hold until '
+        'the next one; others see a correction that much later, the motion at once',
         unit='s',
         minimum=0.0,
         maximum=10.0,
@@ -69,7 +68,7 @@ class ObserverNodeSettings(InputSettings):
         True, 'Whether map_frame to odom_frame or base_frame is published on /tf', basic=True
     )
     invert_tf: bool = parameter(
-        False, 'Whether the transform on /tf is published as its inverse, with map_frame below'
+        False, 'Whether the transform on /tf is its inverse, with map_frame below'
     )
     path_length: int = parameter(
         2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
@@ -105,8 +104,8 @@ class ObserverNodeSettings(InputSettings):
     )
     map_file: str = parameter(
         '',
-        'Map to load at the start: one saved earlier, or surveyed landmarks; or a folder of maps, '
-        'and the robot is found in one of them; empty for none',
+        'Map to load at the start, saved or surveyed; or a folder of maps, in one of which the'
+        ' robot is found; empty for none',
         basic=True,
     )
     map_path: str = parameter(
@@ -114,12 +113,12 @@ class ObserverNodeSettings(InputSettings):
     )
     pose_file: str = parameter(
         '',
-        'File in which the pose is kept every two seconds and at the end, and from which the next '
-        'start takes it, as ~/.ros/observer_pose.yaml; empty for none',
+        'File that keeps the pose, every two seconds and at the end, for the next start, as '
+        '~/.ros/observer_pose.yaml; empty for none',
     )
     pose_file_max_age: float = parameter(
         600.0,
-        'Age of that file, by the clock of the system, up to which it is used',
+        "Age, by the system's clock, up to which that file is used",
         unit='s',
         minimum=0.0,
         maximum=1e9,
