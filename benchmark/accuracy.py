@@ -62,7 +62,9 @@ def main() -> None:
         args.json.write_text(json.dumps(report.to_json(results), indent=1) + '\n')
     if args.write_docs:
         (DOCS / 'images').mkdir(parents=True, exist_ok=True)
-        (DOCS / 'benchmark.md').write_text(report.document(results), encoding='utf-8')
+        page = DOCS / 'benchmark.md'
+        text = report.rewritten(page.read_text(encoding='utf-8'), results)
+        page.write_text(text, encoding='utf-8')
         report.draw(results, DOCS / 'images' / 'benchmark.png')
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
@@ -24,16 +24,14 @@ from variants import CLEAN, FALSE_POINTS, LEFT_OUT, NO_IDS, OUTLIER_COLUMNS, OUT
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.placement import DESIGNS
-from slam_observer_ros.runs.figures import BLACK, BLUE, GREEN, RED, save, STYLE
+from slam_observer_ros.runs.figures import BLACK, GREEN, RED, save, STYLE
 
 LEFT_OUT_COLUMN = 'riccati, these points left out'
 GROWTH_COLUMNS = (*OUTLIER_COLUMNS, 'riccati' + WORST, LEFT_OUT_COLUMN)
 
 DRAWN: dict[str, dict[str, Any]] = {
     column: {'color': colour, 'marker': marker}
-    for column, colour, marker in zip(
-        (*DESIGNS, EKF), (BLACK, BLUE, GREEN, RED), 'sD^o', strict=True
-    )
+    for column, colour, marker in zip((*DESIGNS, EKF), (BLACK, GREEN, RED), 's^o', strict=True)
 }
 """Estimators in the figure, and how they are drawn."""
 
@@ -63,6 +61,7 @@ AIMS = (
 )
 """Metric, two estimators, and what the ratio of the first to the second should be."""
 
+SUMMARY_TITLE = 'In short'
 SUMMARY_COLUMNS = (
     STARRY_NIGHT,
     MRCLAM_MEAN,
@@ -81,6 +80,9 @@ METRICS: dict[str, tuple[str, int]] = {
 }
 """Title and decimals of each table."""
 
+PRINTED_ONLY = ('heading_rmse_rad', 'landmark_rmse_m')
+"""Metrics whose tables the page does not have."""
+
 OUTLIERS_TITLE = 'Growth of the configuration error with 5 % gross outliers and 1 % swapped ids'
 NO_IDS_TITLE = 'Configuration error and CPU time with and without ids'
 NO_IDS_COLUMNS = tuple(
@@ -94,70 +96,6 @@ WORTH_COLUMNS = ('with, m', 'without, m', 'with / without', 'lowest', 'highest',
 
 BATCHES_TITLE = f'inside, {BATCH_OF_RUNS} runs at a time'
 CONSISTENCY_COLUMNS = ('inside', BATCHES_TITLE, 'pose', 'landmarks')
-
-INTRODUCTION = """\
-# Accuracy, consistency and cost, compared
-
-Written by `python benchmark/accuracy.py --write-docs`; `make benchmark-accuracy` only prints. One
-run, with the same events and noise figures for all: those of `config/wheeled_bearing_range.yaml`
-and `config/stereo_inertial.yaml`, which come from descriptions of the sensors and not from these
-recordings. The simulated worlds have the noise that these files state, but with errors independent
-from one observation to the next. Where errors last (`observation_correlation_time`, for wheeled
-robots) all estimators are given the same larger covariances.
-
-- **constant, riccati**: this project's gain designs. In the wheeled configuration `riccati` also
-  estimates scale, bias and delay of the odometry, which GTSAM and the EKF don't do here;
-  `riccati, no calibration` has that switched off, for a comparison on equal terms.
-- **textbook EKF**: world-frame errors and absolute landmarks (`benchmark/ekf_slam.py`), with the
-  observer's gate and Huber weights.
-- **iSAM2**: GTSAM, updated and read out in full after each observation; relinearizeSkip 1,
-  threshold 0.01 (the more accurate setting), and also with GTSAM's default parameters. One
-  odometry factor between consecutive observations, bearing-range factors with Huber's loss,
-  Pose2/Point2 for planar data.
-- **smoothed** and **GTSAM batch** use all data, including later observations: `riccati` followed
-  by Gauss–Newton over everything; Levenberg–Marquardt from iSAM2's last estimate.
-
-Of Victoria Park there is no true map. What stands for it is the batch optimum of its graph, which
-has neither a bias of the velocity nor slips: its χ² is 6122, and 4029 with a constant bias. So an
-estimate that has both may be nearer to the truth than the table says.
-
-Configuration error: after each observation, the RMS over all landmarks seen three times or more so
-far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. A landmark without id
-is compared with the true one that it was nearest to most often when seen. ATE and heading
-are those of the poses right after the observations, after one rigid alignment of their positions.
-CPU time is that of the estimator's own calls, the least of three runs (of one, where ids are left
-out), in which the estimators take turns, so that the load of the machine affects all alike;
-integrating the velocities, which all but the observer do by the same code, costs what dead
-reckoning costs. `failed`: GTSAM gave up with a singular system, or nothing was mapped. Outliers
-cost something even if each is recognised, since fewer points are left; a column with just these
-points left out shows how much. The cost depends on which points are hit, so outliers are drawn
-four times; all their figures are means, and one column has the worst of the four.
-
-What features are worth: `riccati` with the feature and without it, each on runs of the kind that
-it is there for (`benchmark/features.py`): the five robots of MRCLAM 6, Starry Night begun five
-times half a minute later, five seeds of each simulated loop. Errors are means, their ratio is the
-geometric mean with the extremes beside it, and the last column is the ratio of the CPU times.
-Wheels slip once a minute (`benchmark/slips.py`), by 0.3 to 0.8 rad or 0.5 to 1 m; in the dark
-nothing is seen for 4 s. A robot that is carried is put down 1 to 3 m further, turned by any angle.
-Landmarks that move do so straight on at 0.05 to 0.3 m/s, and the truth with them.
-
-The aims of the first table are for Starry Night and the mean of MRCLAM 6, in bold where they are
-missed; the other columns are single worlds. Errors on Starry Night are at the floor of its truth,
-so no error there is held against an aim: an oracle that is given the true landmarks and fits each
-pose to the points of that image alone errs by 0.033 m, as the recorded attitude and the camera
-disagree. Where four points or more are seen `riccati` errs by 0.031 m against the recorded poses,
-and by 0.017 m against the fitted ones (`python benchmark/studies/oracle.py`).
-
-ANEES: every 5 s, the mean over the Monte Carlo runs of the squared error of the pose (or the
-landmarks) normalised by its covariance and its degrees of freedom; then the mean and the range
-over the run. The band in each table contains 95 % of a consistent estimator's values. There the
-robot moves between two velocities as white noise has it, which all of these estimators assume.
-Where a velocity is off by the same for all of its period, as in the simulated loops, and landmarks
-are seen in between, `riccati` is too careful: its pose's ANEES is 0.74 in 3D and 0.93 on wheels.
-
-![Configuration error and consistency](images/benchmark.png)
-
-"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,9 +121,9 @@ class Results:
     runs: int
 
 
-def tables(results: Results) -> str:
-    """Return all tables as Markdown."""
-    sections = _comparison(results.tables) if results.tables[CLEAN] else []
+def tables(results: Results, left_out: Sequence[str] = ()) -> str:
+    """Return the tables as Markdown, but for some metrics'."""
+    sections = _comparison(results.tables, left_out) if results.tables[CLEAN] else []
     if results.worth:
         rows = {case: _worth(runs) for case, runs in results.worth.items()}
         sections.append(_table(WORTH_TITLE, rows, WORTH_COLUMNS))
@@ -195,17 +133,18 @@ def tables(results: Results) -> str:
     return '\n'.join(sections)
 
 
-def document(results: Results) -> str:
-    """Return the text of docs/benchmark.md."""
-    return INTRODUCTION + tables(results)
+def rewritten(page: str, results: Results) -> str:
+    """Return the text of docs/benchmark.md with other tables below its introduction."""
+    return page[: page.index(f'## {SUMMARY_TITLE}\n')] + tables(results, PRINTED_ONLY)
 
 
-def _comparison(tables: Tables) -> list[str]:
+def _comparison(tables: Tables, left_out: Sequence[str]) -> list[str]:
     """Return the tables that compare estimators."""
-    sections = [_table('In short', _summary(tables), SUMMARY_COLUMNS)]
+    sections = [_table(SUMMARY_TITLE, _summary(tables), SUMMARY_COLUMNS)]
     for metric, (title, decimals) in METRICS.items():
-        cells = _cells(tables[CLEAN], metric, decimals)
-        sections.append(_table(title, cells, estimators.COLUMNS))
+        if metric not in left_out:
+            cells = _cells(tables[CLEAN], metric, decimals)
+            sections.append(_table(title, cells, estimators.COLUMNS))
     sections.append(_table(OUTLIERS_TITLE, _growth(tables), GROWTH_COLUMNS))
     if tables[NO_IDS]:
         sections.append(_table(NO_IDS_TITLE, _without_ids(tables), NO_IDS_COLUMNS))
