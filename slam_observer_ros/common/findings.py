@@ -600,6 +600,65 @@ KINDS = {
     ),
 }
 
+FAULTS = {
+    # The inputs of a node
+    'nothing_published': "nothing publishes on '{topic}' ({wanted} is needed)",
+    'other_type': "'{topic}' carries {types}; {wanted} is needed{hint}",
+    'other_quality': (
+        "'{node}' can't be heard on '{topic}', its quality of service does not fit: {reason}"
+    ),
+    'missing_package': "'{topic}' can't be heard: {error}",
+    'no_message_yet': "no message yet on '{topic}' ({wanted})",
+    'no_message_any_more': "no message on '{topic}' for {for_s:.0f} s, though it has a publisher",
+    'clock_stands': (
+        "/clock stands still for {for_s:.0f} s, and nothing comes on '{topic}': go on with the "
+        'simulation or the recording'
+    ),
+    'busy_node': (
+        "the node was busy for {for_s:.1f} s, in which it read nothing on '{topic}': set "
+        'max_points or max_landmarks lower if it often is'
+    ),
+    'slow_node': (
+        "the node does not keep up: messages on '{topic}' wait {wait_s:.1f} s to be read; send "
+        'fewer of them, or make observations cheaper (max_landmarks)'
+    ),
+    'overload': (
+        "the node does not keep up: of {rate_hz:.1f} messages a second on '{topic}' it uses "
+        '{used_hz:.1f}, the newest (dropped: overload); send no more than that, or fewer points '
+        'in each, or make observations cheaper (max_landmarks)'
+    ),
+    # Their clocks
+    'stamps_of_1970': (
+        'stamps on {topic} are of 1970: they count from the start of a driver or machine (let it '
+        'stamp with the time of ROS, or set correct_clock_offset), or are of a simulation '
+        '({simulation})'
+    ),
+    'stamps_off': 'stamps on {topic} are {off}{late} {advice}, or set correct_clock_offset',
+    'stamp_ahead': (
+        "a stamp on {topic} was {ahead_s:.3f} s ahead of this machine's clock: {advice}"
+    ),
+    'odometry_ahead': (
+        "'{odom_frame}' to '{base_frame}' on /tf is {ahead_s:.3f} s ahead of this machine's "
+        'clock: synchronise the clocks of what publishes it'
+    ),
+    # Its transform
+    'odometry_behind': (
+        "'{odom_frame}' to '{base_frame}' on /tf is {behind}: '{map_frame}' to '{odom_frame}' "
+        'waits for it; look at what publishes it'
+    ),
+    'odometry_too_new': 'odometry on /tf is stamped far ahead of the estimate: {error}',
+    'other_parent': (
+        "'{base_frame}' has the parent '{parent}' on /tf, so that no pose is published there: set "
+        "odom_frame to the frame of the odometry, or base_frame to the robot's uppermost frame, "
+        'or publish_tf to false'
+    ),
+    'rival': (
+        "another node publishes '{parent}' to '{child}' on {topic}, too: end it (it may be "
+        '{whose}), give each robot its own frames, or set publish_tf to false'
+    ),
+}
+"""What inputs, clocks and transforms of a node have, and what to do about it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Finding:
@@ -639,6 +698,11 @@ def found(kind: str, /, **figures: object) -> Finding:
     return Finding(
         kind, stated.level, stated.what.format(**figures), stated.remedy.format(**figures)
     )
+
+
+def fault(kind: str, /, **figures: object) -> str:
+    """Return a fault of a node in words, with its figures."""
+    return FAULTS[kind].format(**figures)
 
 
 NAMED = 3

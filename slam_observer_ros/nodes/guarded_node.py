@@ -21,6 +21,8 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
+from slam_observer_ros.common.findings import Finding, found
+
 REPORT_PERIOD_S = 10.0
 """Shortest time between two lines about one subject."""
 
@@ -48,6 +50,12 @@ class ThrottledLog:
         if is_due:
             self._node.get_logger().warning(text)
         return is_due
+
+    def event(self, kind: str, subject: str, note: str = '', **figures: object) -> Finding:
+        """Log a finding of a kind, with a note behind what is wrong, likewise; return it."""
+        finding = found(kind, **figures)
+        self.warning(subject, finding.text(note))
+        return finding
 
     def info(self, subject: str, text: str) -> None:
         """Log information, unless there was some about the subject lately."""

@@ -30,10 +30,10 @@ from slam_observer_ros.lie.matrices import are_covariances, limited
 from slam_observer_ros.mapping.landmark_map import MAX_NUMBER
 from slam_observer_ros.messages.poses import decode_pose_with_covariance_stamped, PoseMessage
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.intake.lateness import FUTURE_NS
 from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.map_services import absolute, is_there
 from slam_observer_ros.nodes.ros_interface import RELIABLE_QOS
+from slam_observer_ros.runs.live_health import FUTURE_NS
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.tracking.covariances import MAX_POSE_ERRORS, of_moved_pose

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.common.findings import Finding, found
+from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
@@ -34,6 +34,7 @@ from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.ros_interface import is_installed, message_class
 from slam_observer_ros.recordings.odometry import OdometryCheck
+from slam_observer_ros.runs.live_health import of_twist
 from slam_observer_ros.settings.input_settings import (
     AUTO,
     message_types,
@@ -180,7 +181,7 @@ class OdometryDecoder:
         elif not self._check.is_decided:
             self._check.add(pose, velocity)
             if self._check.problem:
-                self._warn('wrong_twist', problem=self._check.problem)
+                self._warn(self._check.problem)
         return velocity
 
     def _look_for_velocities(self, pose: PoseMessage, event: VelocityEvent) -> None:
@@ -193,10 +194,10 @@ class OdometryDecoder:
         if self._first is None:
             self._first = pose.position
         if np.linalg.norm(pose.position - self._first) > MOVED_M:
-            self._warn('zero_twist')
+            self._warn()
 
-    def _warn(self, kind: str, **figures: object) -> None:
-        self.doubt = found(kind, topic=f"'{self._topic}'", **figures)
+    def _warn(self, problem: str = '') -> None:
+        self.doubt = of_twist(f"'{self._topic}'", problem)
         self._node.get_logger().warning(self.doubt.text())
 
 

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 import time
+from typing import TypeAlias
 
 from rclpy.node import Node
 
 from slam_observer_ros.common.errors import TransformError
-from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
@@ -22,7 +22,6 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.messages.clouds import scan_problem
 from slam_observer_ros.nodes.guarded_node import described, ThrottledLog
-from slam_observer_ros.nodes.intake.lateness import ClockChange, ClockOffset
 from slam_observer_ros.recordings.event_builder import (
     drop_reason,
     DropError,
@@ -31,6 +30,7 @@ from slam_observer_ros.recordings.event_builder import (
     with_receive_time,
 )
 from slam_observer_ros.recordings.frames import BaseFrame
+from slam_observer_ros.runs.live_health import ClockOffset
 from slam_observer_ros.settings.input_settings import ON_TF
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
@@ -44,6 +44,86 @@ SOURCES: dict[type[Event], str] = {
 
 MAX_SENSORS = 100
 """Frames whose clocks are looked at: somebody may publish under ever new names."""
+
+
+Use: TypeAlias = Callable[[], None]
+"""Uses a message that was held."""
+
+AROUND_S = 0.5
+"""How much later than /clock messages of the run before may come, by a steady clock."""
+
+MAX_LOOKS = 25
+"""How often a node looks whether /clock has jumped, every 20 ms, before it uses what it holds.
+
+Not a time: a node that was held up itself has not seen yet what has come meanwhile.
+"""
+
+MAX_HELD = 10_000
+"""Messages that may wait for /clock to jump."""
+
+
+class ClockChange:
+    """Holds messages of the next run until /clock has jumped, and finds the last run's.
+
+    Topics come in no order. Before the jump what is too late to be used may be of the next run.
+    After it what is nearer to the time before is of the last one.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[Use] = []
+        self._looks = 0  # since it holds anything
+        self._is_jumping = False
+        self._jumped_s = -AROUND_S
+        self._back_ns = 0
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether a message waits for /clock to jump."""
+        return bool(self._held)
+
+    def begin(self, back_ns: int) -> None:
+        """Take that /clock has jumped back, nanoseconds; until the end the last run is used up."""
+        self._is_jumping = True
+        self._jumped_s = time.monotonic()
+        self._back_ns = back_ns
+
+    def end(self) -> list[Use]:
+        """Return what is of the next run, which is used from now on."""
+        self._is_jumping = False
+        return self._take()
+
+    def hold(self, use: Use, stamp_ns: int, receive_ns: int, usable_from_ns: int) -> bool:
+        """Keep a message of the next run, or what may be one; return whether it is kept.
+
+        ``stamp_ns`` is its stamp by /clock, ``usable_from_ns`` that before which it is too late.
+        """
+        if self._is_jumping:
+            is_next = not self._is_before_jump(stamp_ns, receive_ns)
+        else:
+            is_next = stamp_ns < usable_from_ns
+        if not is_next or len(self._held) >= MAX_HELD:
+            return False
+        if not self._held:
+            self._looks = 0
+        self._held.append(use)
+        return True
+
+    def is_over(self, stamp_ns: int, receive_ns: int) -> bool:
+        """Return whether a message is of the last run, and comes after its end."""
+        return not self._is_jumping and self._is_before_jump(stamp_ns, receive_ns)
+
+    def take_overdue(self) -> list[Use]:
+        """Return what was held for too long: the clock does not jump, it was just late."""
+        self._looks += 1
+        return self._take() if self._looks > MAX_LOOKS else []
+
+    def _take(self) -> list[Use]:
+        held, self._held = self._held, []
+        return held
+
+    def _is_before_jump(self, stamp_ns: int, receive_ns: int) -> bool:
+        is_around = time.monotonic() - self._jumped_s < AROUND_S
+        return is_around and stamp_ns > receive_ns + self._back_ns // 2
 
 
 class EstimatorFeed:
@@ -162,8 +242,8 @@ class EstimatorFeed:
         if timed is not measured:
             topic = self._topics[name]
             self.unstamped[topic] += 1
-            finding = found('zero_stamps', topics=topic, count=self.unstamped[topic])
-            self._log.warning(f'stamps of {topic}', finding.text())
+            count = self.unstamped[topic]
+            self._log.event('zero_stamps', f'stamps of {topic}', topics=topic, count=count)
         self._give(self._builder.add(timed, time.monotonic_ns()), name)
 
     def add_observation(self, measured: ObservationEvent, receive_ns: int) -> None:
@@ -175,8 +255,8 @@ class EstimatorFeed:
             count, most = len(measured.ids), self._estimator.settings.max_points
             if count > most:
                 topic = self._topics['landmarks']
-                finding = found('surplus_point', source=topic, count=count, most=most)
-                self._log.warning(f'points of {topic}', finding.text())
+                subject = f'points of {topic}'
+                self._log.event('surplus_point', subject, source=topic, count=count, most=most)
             self.add('landmarks', measured, receive_ns)
 
     def add_observations(self, measured: Sequence[ObservationEvent], receive_ns: int) -> None:
@@ -291,6 +371,5 @@ class EstimatorFeed:
 
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
-        count = self.dropped[reason]
-        finding = found('dropped_message', reason=reason, error=text)
-        self._log.warning(reason, finding.text(f' ({count} so far)'))
+        note = f' ({self.dropped[reason]} so far)'
+        self._log.event('dropped_message', reason, note, reason=reason, error=text)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from inspect import signature
 import math
 import time
@@ -14,13 +16,13 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
-from slam_observer_ros.common.findings import Finding, found
+from slam_observer_ros.common.findings import fault, Finding
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.intake.lateness import Backlog, LoadShedding, Waiting
 from slam_observer_ros.nodes.ros_interface import is_installed, message_class
+from slam_observer_ros.runs.live_health import Backlog, of_publishers, of_types, overload
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.
@@ -42,10 +44,9 @@ Decoder = Callable[[Buffer, int], MessageT]
 
 def rivals(topic: str, publishers: Sequence[TopicEndpointInfo]) -> Finding | None:
     """Report who publishes on a topic, if more than one does; else None."""
-    if len(publishers) < 2:
-        return None
-    names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
-    return found('several_publishers', count=len(names), names=', '.join(names), topic=topic)
+    return of_publishers(
+        topic, [f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers]
+    )
 
 
 def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
@@ -116,6 +117,87 @@ class TypeChoice:
         if now_s - max(self._since_s, last_s) < patience_s:
             return self.chosen
         return published[(published.index(self.chosen) + 1) % len(published)]
+
+
+PERIOD_S = 5.0  # over which it is seen how much is dropped
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """A decoded message that waits to be used.
+
+    ``received_ns`` is when DDS has received it, by the system's time, 0 where it does not say;
+    ``receive_ns`` the same by the ROS clock. Both are nanoseconds.
+    """
+
+    message: Any
+    received_ns: int
+    receive_ns: int
+
+    @property
+    def sensors(self) -> set[str]:
+        """Frames of the sensors whose measurements it has."""
+        parts = self.message if isinstance(self.message, Sequence) else [self.message]
+        return {part.sensor_frame for part in parts}
+
+
+class LoadShedding:
+    """Drops old messages once one has waited too long, so that an estimate does not age.
+
+    Parameters
+    ----------
+    max_wait_s : float
+        How long messages may wait to be read, seconds. If one has waited longer, only the newest
+        of each sensor is used.
+
+    Attributes
+    ----------
+    shed : int
+        Messages dropped so far.
+
+    """
+
+    def __init__(self, max_wait_s: float) -> None:
+        self._max_wait_s = max_wait_s
+        self._recent: deque[tuple[float, int, int]] = deque()
+        self.shed = 0
+
+    def newest(self, waiting: Sequence[Waiting], now_ns: int, now_s: float) -> list[Waiting]:
+        """Return which of the messages that wait, in order of reception, are to be used.
+
+        ``now_ns`` is the system's time, by which they were received, ``now_s`` a steady one.
+        """
+        oldest_ns = min((each.received_ns for each in waiting if each.received_ns), default=now_ns)
+        kept = list(waiting)
+        if to_s(now_ns - oldest_ns) > self._max_wait_s:
+            kept = _newest_of_each_sensor(waiting)
+        shed = len(waiting) - len(kept)
+        self.shed += shed
+        self._recent.append((now_s, len(waiting), shed))
+        self._forget_before(now_s - PERIOD_S)
+        return kept
+
+    def problem(self, topic: str, now_s: float) -> str:
+        """Report that many messages were dropped lately, and how many would not be; else ''."""
+        self._forget_before(now_s - PERIOD_S)
+        read, shed = sum(each[1] for each in self._recent), sum(each[2] for each in self._recent)
+        return overload(topic, read, shed, now_s - self._recent[0][0] if self._recent else 0.0)
+
+    def _forget_before(self, steady_s: float) -> None:
+        while self._recent and self._recent[0][0] < steady_s:
+            self._recent.popleft()
+
+
+def _newest_of_each_sensor(waiting: Sequence[Waiting]) -> list[Waiting]:
+    """Return the messages without those all of whose sensors have newer ones."""
+    kept: list[Waiting] = []
+    seen: set[str] = set()
+    for each in reversed(waiting):
+        sensors = each.sensors
+        if not sensors or sensors - seen:  # without any it costs nothing, as on /tf
+            kept.append(each)
+        seen |= sensors
+    return kept[::-1]
 
 
 class InputTopic(Generic[MessageT]):
@@ -223,20 +305,15 @@ class InputTopic(Generic[MessageT]):
             return self._fault
         if self.received == 0:
             wanted = self._types.chosen or self._wanted
-            return f"no message yet on '{self.topic}' ({wanted})"
+            return fault('no_message_yet', topic=self.topic, wanted=wanted)
         now_s = time.monotonic()
         if (silent_s := self.silent_s) > DISCOVERY_S:
             if self._clock_stands:
-                return (
-                    f'/clock stands still for {now_s - self._clock_since_s:.0f} s, and nothing '
-                    f"comes on '{self.topic}': go on with the simulation or the recording"
-                )
-            return f"no message on '{self.topic}' for {silent_s:.0f} s, though it has a publisher"
+                for_s = now_s - self._clock_since_s
+                return fault('clock_stands', topic=self.topic, for_s=for_s)
+            return fault('no_message_any_more', topic=self.topic, for_s=silent_s)
         if self._held_s and now_s - self._resumed_s < DISCOVERY_S:
-            return (
-                f'the node was busy for {self._held_s:.1f} s, in which it read nothing on '
-                f"'{self.topic}': set max_points or max_landmarks lower if it often is"
-            )
+            return fault('busy_node', topic=self.topic, for_s=self._held_s)
         return self.shedding.problem(self.topic, now_s) or self.backlog.problem(self.topic, now_s)
 
     @property
@@ -318,9 +395,7 @@ class InputTopic(Generic[MessageT]):
                 self.close()
         if len(usable) > 1:
             others = ', '.join(name for name in usable if name != chosen)
-            self._several_types = found(
-                'several_types', topic=self.topic, heard=chosen, others=others
-            )
+            self._several_types = of_types(self.topic, chosen, others)
         return missing
 
     def _subscribe_if_installed(self, type_name: str) -> str:
@@ -328,7 +403,7 @@ class InputTopic(Generic[MessageT]):
         try:
             self._subscribe(type_name)
         except ParameterError as error:
-            return f"'{self.topic}' can't be heard: {error}"
+            return fault('missing_package', topic=self.topic, error=error)
         return ''
 
     def _subscribe(self, type_name: str) -> None:
@@ -392,9 +467,13 @@ class InputTopic(Generic[MessageT]):
             message = self._decoders[self._types.chosen](raw, receive_ns)
         except MessageError as error:
             self.malformed += 1
-            finding = found('malformed_message', topic=f"'{self.topic}'", error=error)
-            self.last_malformed = finding
-            self._log.warning(self.topic, finding.text(f' ({self.malformed} so far)'))
+            self.last_malformed = self._log.event(
+                'malformed_message',
+                self.topic,
+                f' ({self.malformed} so far)',
+                topic=f"'{self.topic}'",
+                error=error,
+            )
             return []
         return [Waiting(message, self._received_ns, receive_ns)]
 
@@ -420,18 +499,17 @@ class InputTopic(Generic[MessageT]):
 
     def _find_fault(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
         """Return why no publisher can be heard; empty if all can."""
-        wanted = self._wanted
+        topic, wanted = self.topic, self._wanted
         if not publishers:
-            return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
+            return fault('nothing_published', topic=topic, wanted=wanted)
         if not usable:
             types = sorted({publisher.topic_type for publisher in publishers})
             hint = ''.join(f'; set {self.advice[t]}' for t in types if t in self.advice)
-            return f"'{self.topic}' carries {', '.join(types)}; {wanted} is needed{hint}"
+            listed = ', '.join(types)
+            return fault('other_type', topic=topic, types=listed, wanted=wanted, hint=hint)
         for publisher in publishers:
             compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
             if compatibility == QoSCompatibility.ERROR:
-                return (
-                    f"'{publisher.node_name}' can't be heard on '{self.topic}', its quality of "
-                    f'service does not fit: {reason.strip()}'
-                )
+                reason = reason.strip()
+                return fault('other_quality', node=publisher.node_name, topic=topic, reason=reason)
         return ''

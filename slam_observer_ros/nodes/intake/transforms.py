@@ -9,7 +9,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from slam_observer_ros.common.errors import MessageError, TransformError
-from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.detections import CAMERA_INFO, decode_camera_info
@@ -86,8 +85,7 @@ class LiveTransforms:
             frame, camera = decode_camera_info(raw)
         except MessageError as error:
             topic = f"'{self._node.resolve_topic_name(CAMERA_TOPIC)}'"
-            finding = found('malformed_message', topic=topic, error=error)
-            self._log.warning(CAMERA_TOPIC, finding.text())
+            self._log.event('malformed_message', CAMERA_TOPIC, topic=topic, error=error)
             return
         self._buffer.cameras[frame.lstrip('/')] = camera
 
@@ -98,8 +96,7 @@ class LiveTransforms:
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
-                finding = found('malformed_message', topic=f"'{topic}'", error=error)
-                self._log.warning(topic, finding.text())
+                self._log.event('malformed_message', topic, topic=f"'{topic}'", error=error)
                 return
             if self._sent is not None:
                 for each in transforms:

@@ -9,8 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
-from slam_observer_ros.common.types import is_automatic
+from slam_observer_ros.common.findings import Finding, in_brief, Level, worst_first
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
@@ -19,25 +18,10 @@ from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublis
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus
 from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
 from slam_observer_ros.runs.corrections import explained, ODOMETRY_CAUSES
-from slam_observer_ros.runs.health import (
-    estimator_values,
-    of_all_learnt,
-    of_estimate,
-    of_left_out,
-    of_map_without_ids,
-    of_rejections,
-    of_stamps,
-    of_velocity,
-)
+from slam_observer_ros.runs.health import estimator_values, of_all_learnt
+from slam_observer_ros.runs.live_health import InputNumbers, of_node, Progress
 
-SILENT_S = 2.0  # an input without messages for this long is a warning
 RECENT = 30  # statuses, of about a second each, over which rejected points are counted
-MIN_POINTS = 50  # points that it takes to say how large a share of them is rejected
-MANY_EMPTY = 200  # messages without a landmark, that are no detector that waits for one
-MANY_UNUSED = 20  # messages, none of which was used, that are no transient of the start
-
-USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
-"""Inputs, and what their messages are counted as when they are used."""
 
 
 class DiagnosticsPublisher:
@@ -154,38 +138,36 @@ class DiagnosticsPublisher:
         return self._estimator.dropped + self._feed.dropped + shed
 
     def _findings(self, dropped: Counter[str], new: Counter[str]) -> list[Finding]:
-        """Judge where the robot is, what came, and what is estimated."""
-        findings: list[Finding] = []
-        if not self._estimator.is_localised:
-            findings.append(found('unknown_pose'))
-            # Landmarks that came without an id have one that was given here.
-            estimator = self._estimator
-            problem = estimator.localisation_problem
-            if is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses):
-                findings += [problem] if problem else []
-        if dropped:  # what came while the node was paused or inactive was not to be used
-            findings += [found_so for source in self._inputs for found_so in self._of_use(source)]
-        findings += [
-            found('silent_input', topic=source.topic)
+        """Return what is wrong by what was counted since the last time."""
+        malformed = Counter({source.topic: source.malformed for source in self._inputs})
+        unreadable, unstamped = malformed - self._last_malformed, self._feed.unstamped
+        inputs = [
+            InputNumbers(
+                source.name,
+                source.topic,
+                source.received,
+                source.silent_s,
+                source.problem,
+                source.doubt,
+                source.last_malformed if unreadable[source.topic] else None,
+            )
             for source in self._inputs
-            if not source.problem and source.silent_s > SILENT_S
         ]
-        if self._feed.is_paused:
-            findings.append(found('paused'))
-        elif dropped:
-            (reason, _), *others = dropped.most_common()
-            count = f'{dropped.total()} message{"s" * (dropped.total() != 1)}'
-            reasons = f'mostly {reason}' if others else reason
-            findings.append(found('dropped_messages', count=count, reasons=reasons))
-        findings += self._of_messages()
-        findings += self._of_empty_messages() + self._estimator.ids_at_two_places
-        findings += of_left_out(new, Level.WARNING)
         self._recent_counts.append(new)
-        recent = sum(self._recent_counts, Counter())
-        if recent['observed_point'] >= MIN_POINTS:
-            findings += of_rejections(recent, 'seen lately ')
-        findings += of_velocity(self._estimator) + of_estimate(self._estimator)
-        findings += of_map_without_ids(self._estimator, self._estimator.ambiguity)
+        progress = Progress(
+            dropped,
+            new,
+            unstamped - self._last_unstamped,
+            sum(self._recent_counts, Counter()),
+            is_paused=self._feed.is_paused,
+            has_seen=self._seen_s is not None,
+        )
+        self._last_malformed, self._last_unstamped = malformed, unstamped.copy()
+        findings = of_node(self._estimator, inputs, progress)
+        for finding in findings:
+            if finding.kind == 'empty_messages' and not self._said_empty:
+                self._said_empty = True
+                self._node.get_logger().warning(finding.text())
         return findings
 
     def _faults(self) -> list[str]:
@@ -197,34 +179,3 @@ class DiagnosticsPublisher:
         faults.append(self._estimate_publisher.problem)
         faults.append(self._node.last_failure)
         return [fault for fault in faults if fault]
-
-    def _of_use(self, source: InputTopic[Any]) -> list[Finding]:
-        """Report an input whose messages come, and not one of them was used so far."""
-        kind = USED_AS.get(source.name)
-        if kind is None or source.received < MANY_UNUSED or self._feed.is_paused:
-            return []
-        if self._last_counts[kind]:
-            return []
-        return [found('unused_input', count=source.received, topic=source.topic)]
-
-    def _of_messages(self) -> list[Finding]:
-        """Report inputs whose messages can't be read, have no stamp, or say what can't be."""
-        malformed = Counter({source.topic: source.malformed for source in self._inputs})
-        unreadable, unstamped = malformed - self._last_malformed, self._feed.unstamped
-        said = [source.last_malformed for source in self._inputs if unreadable[source.topic]]
-        said += [source.doubt for source in self._inputs]
-        findings = [finding for finding in said if finding is not None]
-        findings += of_stamps(unstamped - self._last_unstamped)
-        self._last_malformed, self._last_unstamped = malformed, unstamped.copy()
-        return findings
-
-    def _of_empty_messages(self) -> list[Finding]:
-        """Report, and log once, that a detector has not seen anything so far."""
-        observations = self._last_counts['observation']
-        if self._seen_s is not None or observations < MANY_EMPTY:
-            return []
-        finding = found('empty_messages', count=observations)
-        if not self._said_empty:
-            self._said_empty = True
-            self._node.get_logger().warning(finding.text())
-        return [finding]

@@ -13,6 +13,7 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from std_msgs.msg import Float64
 from visualization_msgs.msg import MarkerArray
 
+from slam_observer_ros.common.findings import fault
 from slam_observer_ros.common.stamps import is_due, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimate import Estimate
@@ -143,10 +144,12 @@ class EstimatePublisher:
         age_s = self.odometry_age_s
         if age_s is None or age_s > -MAX_AHEAD_S:
             return ''
-        odom_frame, base_frame = self._settings.odom_frame, self._settings.base_frame
-        text = (
-            f"'{odom_frame}' to '{base_frame}' on /tf is {-age_s:.3f} s ahead of this machine's "
-            'clock: synchronise the clocks of what publishes it'
+        settings = self._settings
+        text = fault(
+            'odometry_ahead',
+            odom_frame=settings.odom_frame,
+            base_frame=settings.base_frame,
+            ahead_s=-age_s,
         )
         self._log.warning('early odometry', text)
         return text

@@ -10,13 +10,14 @@ import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Bool
 
-from slam_observer_ros.common.findings import Finding, found, Level
+from slam_observer_ros.common.findings import Finding, Level
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.nodes.guarded_node import ThrottledLog
 from slam_observer_ros.nodes.ros_interface import LATCHED_QOS
 from slam_observer_ros.runs.health import of_fit
+from slam_observer_ros.runs.live_health import localisation
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT = 300  # observations over which innovations are compared with the noise that is stated
@@ -74,8 +75,8 @@ class LocalisationStatus:
     def publish(self) -> None:
         """Publish, and log, whether the robot is localised, if that has changed."""
         share = FOUND_AGAIN if self._is_localised is False else 1.0
-        level, message = self._judge(self._deviations(), share)
-        is_localised = level != DiagnosticStatus.ERROR and self._estimator.stamp_ns is not None
+        level, message = localisation(self._estimator, self._settings, self._deviations(), share)
+        is_localised = level < Level.ERROR and self._estimator.stamp_ns is not None
         if is_localised == self._is_localised:
             return
         if self._is_localised:
@@ -94,10 +95,10 @@ class LocalisationStatus:
     def status(self, hardware_id: str, findings: Iterable[Finding]) -> DiagnosticStatus:
         """Return the status for /diagnostics, with those findings that nothing else explains."""
         deviations = self._deviations()
-        level, message = self._judge(deviations)
+        level, message = localisation(self._estimator, self._settings, deviations)
         for finding in findings:
             if finding.level >= Level.WARNING:
-                level = max(level, DiagnosticStatus.WARN)
+                level = max(level, Level.WARNING)
                 message = f'{message}; {finding.what}'
         known = ('unknown', 'unknown') if deviations is None else [f'{d:.3f}' for d in deviations]
         values = {
@@ -107,7 +108,7 @@ class LocalisationStatus:
             'innovations / stated noise': str(self._noise),
         }
         return DiagnosticStatus(
-            level=level,
+            level=bytes([level]),
             name=f'{self._node.get_fully_qualified_name().lstrip("/")}: localisation',
             hardware_id=hardware_id,
             message=message,
@@ -120,37 +121,6 @@ class LocalisationStatus:
             return None
         covariance = self._estimator.pose_covariance
         return None if covariance is None else deviations(covariance)
-
-    def _judge(
-        self, deviations: tuple[float, float] | None, share: float = 1.0
-    ) -> tuple[bytes, str]:
-        """Return level and message; the robot is lost from a share of the error level on."""
-        settings, estimator = self._settings, self._estimator
-        if estimator.stamp_ns is None:
-            return DiagnosticStatus.WARN, 'no estimate yet'
-        if not estimator.is_localised:
-            return DiagnosticStatus.ERROR, 'the pose in the loaded map is not known'
-        if estimator.is_contradicted:
-            return DiagnosticStatus.ERROR, found('contradicted_pose').what
-        if estimator.map_name and estimator.ambiguity is not None:
-            return (
-                DiagnosticStatus.ERROR,
-                'what is seen fits several places of the map',
-            )
-        if deviations is None:
-            return DiagnosticStatus.OK, 'localised; the gains know no standard deviation'
-        position_m, heading_rad = deviations
-        worst, reasons = DiagnosticStatus.OK, []
-        for name, value, unit, warn, lost in (
-            ('position', position_m, 'm', settings.position_warn, settings.position_error),
-            ('heading', heading_rad, 'rad', settings.heading_warn, settings.heading_error),
-        ):
-            error = share * lost
-            if value > min(warn, error):
-                level = DiagnosticStatus.ERROR if value > error else DiagnosticStatus.WARN
-                worst = max(worst, level)
-                reasons.append(f'{name} uncertain: σ = {value:.2f} {unit}')
-        return worst, '; '.join(reasons) or 'localised'
 
 
 def deviations(covariance: FloatArray) -> tuple[float, float]:

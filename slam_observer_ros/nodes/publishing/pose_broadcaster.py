@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.findings import fault
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.lie import se3
@@ -154,10 +155,7 @@ class PoseBroadcaster:
             whose = 'a static_transform_publisher of a launch file'
         elif not self._child or time.monotonic() - self._rival_s > RIVAL_S:
             return ''
-        return (
-            f"another node publishes '{parent}' to '{child}' on {topic}, too: end it (it may be "
-            f'{whose}), give each robot its own frames, or set publish_tf to false'
-        )
+        return fault('rival', parent=parent, child=child, topic=topic, whose=whose)
 
     def _is_rival(self, parent: str, child: str) -> bool:
         """Return whether a transform gives a frame a parent that has its own from here.
@@ -229,11 +227,7 @@ class PoseBroadcaster:
             forbids = settings.odom_frame and not settings.invert_tf
             self._parent = parent if forbids and parent != settings.map_frame else ''
         if self._parent:
-            self._report(
-                f"'{settings.base_frame}' has the parent '{self._parent}' on /tf, so that no pose "
-                'is published there: set odom_frame to the frame of the odometry, or base_frame '
-                "to the robot's uppermost frame, or publish_tf to false"
-            )
+            self._report('other_parent', parent=self._parent)
         return self._parent
 
     def _report_delay(self, newest_ns: int | None) -> None:
@@ -243,18 +237,18 @@ class PoseBroadcaster:
         behind_ns = self._waiting[-1][0] - known_ns
         if self._child != settings.odom_frame or behind_ns <= LATE_NS:
             return
-        problem = (
-            'without stamps' if newest_ns == 0 else f'{to_s(behind_ns):.1f} s behind the estimate'
-        )
-        self._report(
-            f"'{settings.odom_frame}' to '{settings.base_frame}' on /tf is {problem}: "
-            f"'{settings.map_frame}' to '{settings.odom_frame}' waits for it; look at what "
-            'publishes it'
-        )
+        behind = f'{to_s(behind_ns):.1f} s behind the estimate'
+        self._report('odometry_behind', behind='without stamps' if newest_ns == 0 else behind)
 
-    def _report(self, problem: str) -> None:
-        self.problem = problem
-        self._log.warning('/tf', problem)
+    def _report(self, kind: str, **figures: object) -> None:
+        settings = self._settings
+        frames = {
+            'map_frame': settings.map_frame,
+            'odom_frame': settings.odom_frame,
+            'base_frame': settings.base_frame,
+        }
+        self.problem = fault(kind, **frames, **figures)
+        self._log.warning('/tf', self.problem)
 
     def _publish_correction(self, newest_ns: int | None) -> None:
         """Publish the newest correction that the odometry known by now gives."""
@@ -270,7 +264,7 @@ class PoseBroadcaster:
             odometry = self._transforms.lookup(settings.odom_frame, settings.base_frame, stamp_ns)
         except TransformError as error:
             if stamp_ns < newest_ns - MAX_WAITING_NS:  # else it is of before the odometry began
-                self._report(f'odometry on /tf is stamped far ahead of the estimate: {error}')
+                self._report('odometry_too_new', error=error)
             return
         self._correction = pose @ se3.inverse(odometry)
         self._publish(stamp_ns + self._held_back_ns + self._tolerance_ns, self._correction)

@@ -1,0 +1,300 @@
+"""The judge of a running node: what is wrong with its inputs, their clocks, /tf and its place.
+
+Nodes hand over what they count and measure, and show what is found here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median_low
+
+from slam_observer_ros.common.findings import fault, Finding, found, Level
+from slam_observer_ros.common.stamps import is_of_1970, to_s
+from slam_observer_ros.common.types import is_automatic
+from slam_observer_ros.estimator.estimate import Estimate
+from slam_observer_ros.runs.health import (
+    of_estimate,
+    of_left_out,
+    of_map_without_ids,
+    of_rejections,
+    of_stamps,
+    of_velocity,
+)
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+SILENT_S = 2.0
+"""An input without messages for this long is a warning."""
+
+MIN_POINTS = 50
+"""Points that it takes to say how large a share of them is rejected."""
+
+MANY_EMPTY = 200
+"""Messages without a landmark, that are no detector that waits for one."""
+
+MANY_UNUSED = 20
+"""Messages, none of which was used, that are no transient of the start."""
+
+USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
+"""Inputs, and what their messages are counted as when they are used."""
+
+
+@dataclass(frozen=True, slots=True)
+class InputNumbers:
+    """What a node knows of one of its inputs."""
+
+    name: str
+    topic: str
+    received: int
+    silent_s: float
+    problem: str  # why no message comes
+    doubt: Finding | None  # of publishers and content
+    unread: Finding | None  # what was wrong with those that were malformed since the last time
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What was counted since a node was judged last: in all, and of points lately."""
+
+    dropped: Counter[str]
+    counts: Counter[str]
+    unstamped: Counter[str]
+    lately: Counter[str]
+    is_paused: bool
+    has_seen: bool  # any landmark, ever
+
+
+def of_node(
+    estimator: Estimate, inputs: Sequence[InputNumbers], progress: Progress
+) -> list[Finding]:
+    """Judge where the robot is, what came, and what is estimated."""
+    findings = _of_place(estimator)
+    if progress.dropped and not progress.is_paused:
+        # What came while the node was paused or inactive was not to be used.
+        findings += [
+            found('unused_input', count=each.received, topic=each.topic)
+            for each in inputs
+            if each.name in USED_AS
+            and each.received >= MANY_UNUSED
+            and not estimator.counts[USED_AS[each.name]]
+        ]
+    findings += [
+        found('silent_input', topic=each.topic)
+        for each in inputs
+        if not each.problem and each.silent_s > SILENT_S
+    ]
+    if progress.is_paused:
+        findings.append(found('paused'))
+    elif total := progress.dropped.total():
+        (reason, _), *others = progress.dropped.most_common()
+        count = f'{total} message{"s" * (total != 1)}'
+        reasons = f'mostly {reason}' if others else reason
+        findings.append(found('dropped_messages', count=count, reasons=reasons))
+    said = [*(each.unread for each in inputs), *(each.doubt for each in inputs)]
+    findings += [finding for finding in said if finding is not None]
+    findings += of_stamps(progress.unstamped)
+    if not progress.has_seen and (observations := estimator.counts['observation']) >= MANY_EMPTY:
+        findings.append(found('empty_messages', count=observations))
+    findings += estimator.ids_at_two_places
+    findings += of_left_out(progress.counts, Level.WARNING)
+    if progress.lately['observed_point'] >= MIN_POINTS:
+        findings += of_rejections(progress.lately, 'seen lately ')
+    findings += of_velocity(estimator) + of_estimate(estimator)
+    return findings + of_map_without_ids(estimator, estimator.ambiguity)
+
+
+def _of_place(estimator: Estimate) -> list[Finding]:
+    if estimator.is_localised:
+        return []
+    findings, problem = [found('unknown_pose')], estimator.localisation_problem
+    # Landmarks that came without an id have one that was given here.
+    is_by_place = is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)
+    return [*findings, problem] if problem and is_by_place else findings
+
+
+def localisation(
+    estimator: Estimate,
+    limits: ObserverNodeSettings,
+    deviations: tuple[float, float] | None,
+    share: float = 1.0,
+) -> tuple[Level, str]:
+    """Judge, in words too, how well the pose is known, by its standard deviations (m, rad).
+
+    The robot is lost from a share of the error level on.
+    """
+    if estimator.stamp_ns is None:
+        return Level.WARNING, 'no estimate yet'
+    if not estimator.is_localised:
+        return Level.ERROR, 'the pose in the loaded map is not known'
+    if estimator.is_contradicted:
+        return Level.ERROR, found('contradicted_pose').what
+    if estimator.map_name and estimator.ambiguity is not None:
+        return Level.ERROR, 'what is seen fits several places of the map'
+    if deviations is None:
+        return Level.NOTE, 'localised; the gains know no standard deviation'
+    worst, reasons = Level.NOTE, []
+    for name, value, unit, warn, lost in (
+        ('position', deviations[0], 'm', limits.position_warn, limits.position_error),
+        ('heading', deviations[1], 'rad', limits.heading_warn, limits.heading_error),
+    ):
+        error = share * lost
+        if value > min(warn, error):
+            worst = max(worst, Level.ERROR if value > error else Level.WARNING)
+            reasons.append(f'{name} uncertain: σ = {value:.2f} {unit}')
+    return worst, '; '.join(reasons) or 'localised'
+
+
+def of_publishers(topic: str, names: Sequence[str]) -> Finding | None:
+    """Report who publishes on a topic, if more than one does; else None."""
+    if len(names) < 2:
+        return None
+    listed = ', '.join(sorted(names))
+    return found('several_publishers', count=len(names), names=listed, topic=topic)
+
+
+def of_types(topic: str, heard: str, others: str) -> Finding:
+    """Report that types beside the one that is heard are published on a topic."""
+    return found('several_types', topic=topic, heard=heard, others=others)
+
+
+def of_twist(topic: str, problem: str) -> Finding:
+    """Report that an odometry's twist is not how its poses move; without problem, that it is 0."""
+    return found('wrong_twist' if problem else 'zero_twist', topic=topic, problem=problem)
+
+
+BEHIND_S = 0.3
+"""Messages that wait for less, as while a map is loaded, are no matter."""
+
+LASTING_S = 2.0
+"""How long messages have to wait for more than that before it is reported."""
+
+
+class Backlog:
+    """Distinguishes a program that can't keep up with a topic from one busy for a moment.
+
+    ``wait_s`` is how long the last message has waited, seconds.
+    """
+
+    def __init__(self) -> None:
+        self.wait_s = 0.0
+        self._last_s = 0.0
+        self._behind_since_s: float | None = None
+
+    def add(self, wait_s: float, now_s: float) -> None:
+        """Take how long a message that is read now, at a steady time, has waited, seconds.
+
+        That is less than zero if the clock was set meanwhile.
+        """
+        is_long_ago = now_s - self._last_s > LASTING_S
+        self.wait_s, self._last_s = max(wait_s, 0.0), now_s
+        if self.wait_s <= BEHIND_S:
+            self._behind_since_s = None
+        elif self._behind_since_s is None or is_long_ago:
+            self._behind_since_s = now_s
+
+    def problem(self, topic: str, now_s: float) -> str:
+        """Report that messages have waited for long and still do; empty if not."""
+        since_s, last_s = self._behind_since_s, self._last_s
+        if since_s is None or last_s - since_s < LASTING_S or now_s - last_s > LASTING_S:
+            return ''
+        return fault('slow_node', topic=topic, wait_s=self.wait_s)
+
+
+MIN_PERIOD_S = 2.0
+"""Time over which it is seen how much is dropped: who was busy for a moment does keep up."""
+
+MANY_SHED = 0.1
+"""Share of the messages from which on it is reported."""
+
+
+def overload(topic: str, read: int, shed: int, period_s: float) -> str:
+    """Report that many messages of a period were dropped, and how many would not be; else ''."""
+    if period_s < MIN_PERIOD_S or shed <= MANY_SHED * read:
+        return ''
+    rate_hz, used_hz = read / period_s, (read - shed) / period_s
+    return fault('overload', topic=topic, rate_hz=rate_hz, used_hz=used_hz)
+
+
+SAMPLES = 11
+"""Messages whose median offset is looked at: five stragglers in a row change nothing."""
+
+FUTURE_NS = 50_000_000
+"""Stamps that are further ahead of their reception can only be of another clock, nanoseconds."""
+
+
+class ClockOffset:
+    """Offset of the stamps of one publisher, by which they may be of another clock.
+
+    Behind this machine's by more than ``limit_ns``, or ahead of it by ``FUTURE_NS``: a message can
+    be late, but not early.
+
+    Attributes
+    ----------
+    offset_ns : int or None
+        Stamp minus time of reception, median of the last messages; None until known.
+    correction_ns : int
+        What must be added to the stamps to have them in this machine's time; it changes only
+        when the stamps so corrected leave the limit, so that their order is kept.
+
+    """
+
+    def __init__(self, limit_ns: int) -> None:
+        self._limit_ns = self._ahead_ns = limit_ns
+        self._recent: deque[int] = deque(maxlen=SAMPLES)
+        self.offset_ns: int | None = None
+        self.correction_ns = 0
+        self._counts_from_start = False
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the stamps are from another clock."""
+        return self.offset_ns is not None and not self._is_near(self.offset_ns)
+
+    def __str__(self) -> str:
+        """Say how far off the stamps are."""
+        offset_ns = self.offset_ns or 0
+        side = 'ahead of' if offset_ns > 0 else 'behind'
+        return f"{to_s(abs(offset_ns)):.3f} s {side} this machine's clock"
+
+    def problem(self, topic: str, is_simulated: bool) -> str:
+        """Report how far off the stamps on a topic are, or one of late; empty if they are right.
+
+        ``is_simulated``: this machine's clock is /clock.
+        """
+        if self.is_off and self._counts_from_start:
+            simulation = 'whose /clock is another' if is_simulated else 'set use_sim_time'
+            return fault('stamps_of_1970', topic=topic, simulation=simulation)
+        advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
+        if is_simulated:
+            advice = 'see whether their publisher uses /clock, and this machine keeps up with it'
+        if self.is_off:
+            late = ':'
+            if (self.offset_ns or 0) < 0:
+                late = ', or what publishes them is that late: then make it faster; otherwise'
+            return fault('stamps_off', topic=topic, off=self, late=late, advice=advice)
+        ahead_ns = max(self._recent, default=0)
+        if ahead_ns > self._ahead_ns:
+            return fault('stamp_ahead', topic=topic, ahead_s=to_s(ahead_ns), advice=advice)
+        return ''
+
+    def add(self, stamp_ns: int, receive_ns: int, is_simulated: bool = False) -> None:
+        """Take the stamp and the time of reception of a message; by /clock if ``is_simulated``."""
+        # /clock stands still between two of its messages.
+        self._ahead_ns = self._limit_ns if is_simulated else min(FUTURE_NS, self._limit_ns)
+        self._recent.append(stamp_ns - receive_ns)
+        self._counts_from_start = is_of_1970(stamp_ns) and not is_of_1970(receive_ns)
+        if len(self._recent) < SAMPLES:
+            return
+        self.offset_ns = median_low(self._recent)
+        if not self._is_near(self.offset_ns + self.correction_ns):
+            self.correction_ns = -self.offset_ns if self.is_off else 0
+
+    def _is_near(self, offset_ns: int) -> bool:
+        return -self._limit_ns <= offset_ns <= self._ahead_ns
+
+    def clear(self) -> None:
+        """Forget all offsets, as after a jump of this machine's clock."""
+        self._recent.clear()
+        self.offset_ns = None
+        self.correction_ns = 0
