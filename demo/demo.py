@@ -142,15 +142,18 @@ def _is_simulated_time(options: argparse.Namespace) -> bool:
 
 
 def _observer(options: argparse.Namespace, folder: Path) -> NodeContext:
+    reliable = {
+        f'qos_overrides./{topic}.subscription.{policy}': value
+        for topic in ('twist', 'landmarks')
+        for policy, value in (('reliability', 'reliable'), ('depth', QUEUE_DEPTH))
+    }
     return _node(
         'observer_node',
         folder,
         gains='constant',
         velocity_type='TwistStamped',
         landmarks_type='PointCloud2',
-        twist_qos='reliable',
-        landmarks_qos='reliable',
-        queue_depth=QUEUE_DEPTH,
+        **reliable,
         landmarks_max_wait=LANDMARKS_MAX_WAIT_S,
         late_limit=min(60.0, LATE_LIMIT_S * max(1.0, options.real_time_factor)),
         publish_rate=PUBLISH_RATE_HZ,

@@ -175,8 +175,7 @@ def _run_plaza(args: argparse.Namespace) -> None:
         yaw = float(np.arctan2(start[1, 0], start[0, 0]))
         rows['survey, and where it begins'] = (
             f'--load-map {survey} --set set_initial_pose=true '
-            f'--set initial_position=[{start[0, 3]:.3f},{start[1, 3]:.3f},0.0] '
-            f'--set initial_yaw={yaw:.4f} '
+            f'--set initial_pose=[{start[0, 3]:.3f},{start[1, 3]:.3f},0.0,0.0,0.0,{yaw:.4f}] '
         )
     print_table(str(args.output), rows)
 

@@ -20,7 +20,7 @@ from slam_observer_ros.mapping.map_check import (
 )
 from slam_observer_ros.mapping.map_file import read_map, write_map
 from slam_observer_ros.mapping.map_import import import_map, LENGTHS, TAG_AXES
-from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.estimator_settings import ERROR_PROBABILITY, Settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -155,7 +155,7 @@ def _check(args: argparse.Namespace) -> None:
         math.radians(args.fov),
         args.sigma,
         settings.map_noise,
-        settings.localization_error_probability,
+        ERROR_PROBABILITY,
     )
     same = symmetries(known)
     another = place_for_another(known, same[0]) if same else None

@@ -176,7 +176,7 @@ def _advice(result: Replay) -> str:
         return '; they contradict the pose that was given'
     return (
         '. Where the start is known: --set set_initial_pose=true '
-        '--set initial_position=[X,Y,Z] --set initial_yaw=YAW'
+        '--set initial_pose=[X,Y,Z,ROLL,PITCH,YAW]'
     )
 
 

@@ -453,7 +453,7 @@ KINDS = {
     ),
     'ignored_start': Kind(
         Level.WARNING,
-        'no effect of initial_position and initial_yaw',
+        'no effect of initial_pose',
         'use set_initial_pose: true',
     ),
     # A loaded map

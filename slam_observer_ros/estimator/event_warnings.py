@@ -108,8 +108,7 @@ class EventWarnings:
         is_ignored = 'use_tag_orientation' in gains.ignores
         if settings.use_tag_orientation and gains.tags is None and not is_ignored:
             logger.warning('%s', found('ignored_orientations'))
-        is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
-        if is_given and not settings.set_initial_pose:
+        if any(settings.initial_pose) and not settings.set_initial_pose:
             logger.warning('%s', found('ignored_start'))
 
     def _warn_once(self, kind: str, **figures: object) -> None:

@@ -148,11 +148,11 @@ class Placement:
             self.localiser.search_near(rough, given + np.diag(GIVEN_POSE_STD**2))
 
     def _start_where_settings_say(self) -> None:
-        settings = self._settings
-        turn = settings.initial_roll, settings.initial_pitch, settings.initial_yaw
-        deviations = settings.initial_angle_stddev, settings.initial_position_stddev
-        pose = se3.from_rpy((*settings.initial_position, *turn))
-        self.start(pose, np.diag(np.repeat(deviations, 3) ** 2))
+        pose, of_position_and_turn = (
+            self._settings.initial_pose,
+            self._settings.initial_pose_stddev,
+        )
+        self.start(se3.from_rpy(pose), np.diag(np.repeat(of_position_and_turn[::-1], 3) ** 2))
 
     def _state_at(self, pose: FloatArray) -> State:
         """Return a state at its start, with P° = ``pose`` (4, 4)."""

@@ -25,6 +25,7 @@ from slam_observer_ros.mapping.places import (
     Places,
     Weighing,
 )
+from slam_observer_ros.settings.estimator_settings import ERROR_PROBABILITY
 from slam_observer_ros.tracking.state import State
 
 logger = logging.getLogger(__name__)
@@ -104,9 +105,8 @@ class Finder:
         p = state.axes.p
         seen = Constellation(state.observer.points[rows], P[p:, p:], np.full(len(rows), -1))
         ids = state.landmarks.ids[rows]
-        error_probability = state.settings.localization_error_probability
-        self.places = places = self._search(seen, ids, error_probability)
-        place = places.decided(error_probability)
+        self.places = places = self._search(seen, ids)
+        place = places.decided(ERROR_PROBABILITY)
         if place is None:
             return None
         matched = place.rows >= 0
@@ -137,18 +137,16 @@ class Finder:
         self._searched = news
         return is_due
 
-    def _search(self, seen: Constellation, ids: IntArray, error_probability: float) -> Places:
+    def _search(self, seen: Constellation, ids: IntArray) -> Places:
         """Search by the landmarks seen last, and weigh what fits by all of them."""
         reached = [known.mapped.within_reach(seen.points[:MAX_SOUGHT]) for known in self._maps]
         near = reduce(np.intersect1d, reached)
-        parts = self._find_places(seen.select(near), ids[near], error_probability)
+        parts = self._find_places(seen.select(near), ids[near])
         if len(near) < len(seen):
             parts = {i: self._maps[i].weighed(part, seen, ids, near) for i, part in parts.items()}
         return Places.in_several_maps(parts)
 
-    def _find_places(
-        self, sought: Constellation, ids: IntArray, error_probability: float
-    ) -> dict[int, Places]:
+    def _find_places(self, sought: Constellation, ids: IntArray) -> dict[int, Places]:
         """Search all maps, that which was the most likely one last time first."""
         best = 0 if self.places is None or not self.places.all else self.places.all[0].map_index
         order = sorted(range(len(self._maps)), key=lambda i: i != best)
@@ -162,7 +160,7 @@ class Finder:
             known = self._maps[i]
             seen = replace(sought, only=known.named(ids))
             parts[i] = find_places(
-                known.mapped, seen, known.prior, error_probability, rival, looks
+                known.mapped, seen, known.prior, ERROR_PROBABILITY, rival, looks
             )
             rival = max(rival, _largest_mass(parts[i]))
         return parts

@@ -19,6 +19,7 @@ from slam_observer_ros.filter.landmark_table import MIN_LOOP
 from slam_observer_ros.filter.robust import accepted
 from slam_observer_ros.lie.matrices import cholesky, mahalanobis
 from slam_observer_ros.mapping.merging import without_frame
+from slam_observer_ros.settings.estimator_settings import ERROR_PROBABILITY
 from slam_observer_ros.tracking.state import State
 
 logger = logging.getLogger(__name__)
@@ -197,7 +198,7 @@ class LoopClosure:
         odds = -0.5 * (distances**2 + np.linalg.slogdet(2.0 * math.pi * S)[1]) - log_density
         odds -= alone * math.log1p(-p)
         best = int(np.argmax(np.where(may_be_one, odds, -np.inf)))
-        is_sure = odds[best] > -math.log(state.settings.localization_error_probability)
+        is_sure = odds[best] > -math.log(ERROR_PROBABILITY)
         is_sure &= may_be_one[best]
         return (first[[best]], second[[best]]) if is_sure else None
 
@@ -241,11 +242,10 @@ def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArr
     root = without_frame(cholesky(of_new), G)
     shape = root @ root.T + LEAST_M**2 * np.eye(m * k)
     seen = Constellation(points[new], shape, np.full(m, -1))
-    error_probability = state.settings.localization_error_probability
     of_pose = state.known_errors.pose_covariance()
     prior = Anywhere(known) if of_pose is None else Near(np.eye(4), of_pose, axes)
-    places = find_places(known, seen, prior, error_probability)
-    place = places.decided(error_probability)
+    places = find_places(known, seen, prior, ERROR_PROBABILITY)
+    place = places.decided(ERROR_PROBABILITY)
     if place is None or place.matches < MIN_LOOP:
         return None
     matched = place.rows >= 0

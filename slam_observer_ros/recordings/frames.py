@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from slam_observer_ros.common.errors import ParameterError, TransformError
+from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.common.types import FloatArray
@@ -30,7 +30,8 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import is_measured
 from slam_observer_ros.messages.detections import Camera
 from slam_observer_ros.messages.poses import pose_stack, PoseMessage
-from slam_observer_ros.settings.input_settings import InputSettings, Pose6
+from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.parameter_table import check_angles, Pose6
 
 logger = logging.getLogger(__name__)
 
@@ -387,9 +388,5 @@ class BaseFrame:
 
 def _sensor_pose(values: Pose6) -> FloatArray | None:
     """Return the sensor's pose (4, 4) of the settings; None if they give none."""
-    angles_rad = list(values[3:])
-    if np.max(np.abs(angles_rad)) > 2.0 * np.pi:
-        raise ParameterError(
-            f"parameter 'sensor_pose': roll, pitch and yaw are radians, which {angles_rad} are not"
-        )
+    check_angles('sensor_pose', values)
     return se3.from_rpy(values) if any(values) else None

@@ -134,9 +134,9 @@ def localisation(
     if deviations is None:
         return Level.NOTE, 'localised; the gains know no standard deviation'
     worst, reasons = Level.NOTE, []
-    for name, value, unit, warn, lost in (
-        ('position', deviations[0], 'm', limits.position_warn, limits.position_error),
-        ('heading', deviations[1], 'rad', limits.heading_warn, limits.heading_error),
+    for name, value, unit, (warn, lost) in (
+        ('position', deviations[0], 'm', limits.position_limits),
+        ('heading', deviations[1], 'rad', limits.heading_limits),
     ):
         error = share * lost
         if value > min(warn, error):

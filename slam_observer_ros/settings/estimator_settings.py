@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from slam_observer_ros.settings.parameter_table import parameter
+from slam_observer_ros.settings.parameter_table import parameter, Pose6
 
 Vector3 = tuple[float, float, float]
 
 
 MAX_DELAY_S = 1.0
 """Delay of velocities that is made up for at most."""
+
+ERROR_PROBABILITY = 1e-3
+"""How likely the place where points without id fit in a loaded map may be wrong."""
 
 MAX_POSITION_M = 1e7
 """Coordinate of a given pose at most: a map's origin may be UTM's."""
@@ -463,59 +466,25 @@ class Settings:
         choices=('off', 'uncertain', 'fixed'),
         basic=True,
     )
-    localization_error_probability: float = parameter(
-        1e-3,
-        'Riccati, points without id in a loaded map: how likely the place where they fit may '
-        'be wrong',
-        minimum=1e-9,
-        maximum=0.1,
-    )
     set_initial_pose: bool = parameter(
         False,
-        'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded'
-        ' map within the initial_…_stddev, instead of localising by landmarks',
+        'Whether the robot starts at initial_pose: exactly, or in a loaded map within '
+        'initial_pose_stddev, instead of localising by landmarks',
     )
-    initial_position: Vector3 = parameter(
-        (0.0, 0.0, 0.0),
-        'Where the robot starts, x y z, with set_initial_pose',
-        unit='m',
+    initial_pose: Pose6 = parameter(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        'Where the robot starts, x y z and roll pitch yaw, with set_initial_pose',
+        unit='m, rad',
         minimum=-MAX_POSITION_M,
         maximum=MAX_POSITION_M,
     )
-    initial_yaw: float = parameter(
-        0.0,
-        'How the robot is turned at the start, with set_initial_pose',
-        unit='rad',
-        minimum=-6.3,
-        maximum=6.3,
-    )
-    initial_roll: float = parameter(
-        0.0,
-        'Its roll at the start, where it does not stand upright',
-        unit='rad',
-        minimum=-6.3,
-        maximum=6.3,
-    )
-    initial_pitch: float = parameter(
-        0.0,
-        'Its pitch at the start',
-        unit='rad',
-        minimum=-6.3,
-        maximum=6.3,
-    )
-    initial_position_stddev: float = parameter(
-        0.5,
-        'In a loaded map: standard deviation of each coordinate of initial_position',
-        unit='m',
+    initial_pose_stddev: tuple[float, float] = parameter(
+        (0.5, 0.26),
+        'In a loaded map: standard deviation of each coordinate of initial_pose, and of how the '
+        'robot is turned about each axis',
+        unit='m, rad',
         minimum=0.0,
         maximum=1000.0,
-    )
-    initial_angle_stddev: float = parameter(
-        0.26,
-        'In a loaded map: standard deviation of the turn about each axis',
-        unit='rad',
-        minimum=0.0,
-        maximum=3.2,
     )
     map_noise: float = parameter(
         0.05,

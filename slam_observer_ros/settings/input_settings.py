@@ -15,7 +15,7 @@ from pkgutil import iter_modules
 from typing import Any, Literal, TypeAlias, TypeVar
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.settings.parameter_table import parameter
+from slam_observer_ros.settings.parameter_table import parameter, Pose6
 
 Role: TypeAlias = Literal['velocity', 'angular velocity', 'landmarks', 'pose']
 
@@ -92,8 +92,6 @@ AUTO = 'auto'
 
 ON_TF = 'tf'
 """Landmarks are fiducials whose positions, and ids in the names of frames, are on /tf."""
-
-Pose6 = tuple[float, float, float, float, float, float]
 
 POSE_DIFFERENCES = 'pose_differences'
 """Velocity source: the differences of an odometry's poses."""

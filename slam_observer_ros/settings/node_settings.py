@@ -18,19 +18,6 @@ class ObserverNodeSettings(InputSettings):
         choices=lambda: (AUTO, *short_names('velocity')),
         basic=True,
     )
-    twist_qos: str = parameter(
-        'best_effort',
-        'Reliability requested of twist and imu; best_effort fits any publisher',
-        choices=('best_effort', 'reliable'),
-    )
-    landmarks_qos: str = parameter(
-        'best_effort',
-        'Reliability requested of landmarks',
-        choices=('best_effort', 'reliable'),
-    )
-    queue_depth: int = parameter(
-        100, 'Messages of each input kept while the node is busy', minimum=1, maximum=10_000
-    )
     landmarks_max_wait: float = parameter(
         0.05,
         'Overload: once a message on landmarks has waited this long, only the newest of each '
@@ -70,37 +57,16 @@ class ObserverNodeSettings(InputSettings):
     invert_tf: bool = parameter(
         False, 'Whether the transform on /tf is its inverse, with map_frame below'
     )
-    path_length: int = parameter(
-        2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
-    )
-    position_warn: float = parameter(
-        0.5,
+    position_limits: tuple[float, float] = parameter(
+        (0.5, 2.0),
         'Standard deviation of the position, in its worst direction, from which on /diagnostics '
-        'warns',
+        'warns, and from which on it is an error, and ~/is_localised is false',
         unit='m',
         minimum=0.0,
         maximum=1e6,
     )
-    position_error: float = parameter(
-        2.0,
-        'The same, from which on it is an error, and ~/is_localised is false',
-        unit='m',
-        minimum=0.0,
-        maximum=1e6,
-    )
-    heading_warn: float = parameter(
-        0.2,
-        'Standard deviation of the heading from which on /diagnostics warns',
-        unit='rad',
-        minimum=0.0,
-        maximum=1e6,
-    )
-    heading_error: float = parameter(
-        0.5,
-        'The same, from which on it is an error, and ~/is_localised is false',
-        unit='rad',
-        minimum=0.0,
-        maximum=1e6,
+    heading_limits: tuple[float, float] = parameter(
+        (0.2, 0.5), 'The same of the heading', unit='rad', minimum=0.0, maximum=1e6
     )
     map_file: str = parameter(
         '',

@@ -20,6 +20,10 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
 
 
+Pose6: TypeAlias = tuple[float, float, float, float, float, float]
+"""A pose: x y z in metres, and roll pitch yaw in radians."""
+
+
 class Dataclass(Protocol):
     """What :func:`dataclasses.fields` takes."""
 
@@ -180,6 +184,15 @@ def checked(settings: SettingsT) -> SettingsT:
     if not dataclasses.is_dataclass(settings):
         raise ParameterError(f'settings are wanted, not a {type(settings).__name__}')
     return from_parameters(type(settings), dataclasses.asdict(settings))
+
+
+def check_angles(name: str, pose: Pose6) -> None:
+    """Raise a ParameterError if a pose's angles are beyond 2π, as those in degrees are."""
+    angles_rad = list(pose[3:])
+    if max(map(abs, angles_rad)) > 2.0 * math.pi:
+        raise ParameterError(
+            f"parameter '{name}': roll, pitch and yaw are radians, which {angles_rad} are not"
+        )
 
 
 def changed_names(settings: Dataclass) -> list[str]:

@@ -224,7 +224,7 @@ class TestPoseInMapNotKnown:
         )  # fmt: skip
         assert slam_observer(*arguments, '--json').json['localised_after_s'] > 0.0
         x, y, z = (start[:3, 3] + [0.2, -0.1, 0.0]).tolist()
-        given = ('--set', f'initial_position=[{x},{y},{z}]', '--set', 'initial_yaw=0.9')
+        given = ('--set', f'initial_pose=[{x},{y},{z},0,0,0.9]')
         arguments += ('--set', 'set_initial_pose=true', *given)
         assert slam_observer(*arguments, '--json').json['localised_after_s'] == 0.0
         assert 'given at the start' in slam_observer(*arguments).output

@@ -82,7 +82,7 @@ def test_plaza_by_surveyed_radios_whose_ranges_are_long(
     slam_observer.succeed('convert', 'plaza', source, out, '--run', run)
     start = load_plaza(source, run).true_poses[0]
     x, y, yaw = start[0, 3], start[1, 3], np.arctan2(start[1, 0], start[0, 0])
-    placed = 'set_initial_pose=true', f'initial_position=[{x},{y},0.0]', f'initial_yaw={yaw}'
+    placed = 'set_initial_pose=true', f'initial_pose=[{x},{y},0,0,0,{yaw}]'
     settings = [word for setting in placed for word in ('--set', setting)]
     survey = out.with_suffix('.yaml')
     options = ('--config', 'uwb', '--load-map', survey, '--json', *settings)

@@ -26,7 +26,7 @@ class TestSettings:
         landmarks = tmp_path / 'map.yaml'
         slam_observer.succeed('replay', simulated, '--map', landmarks)
         config = self.config(
-            tmp_path, f'map_file: {landmarks}, autosave_map: true, path_length: 9'
+            tmp_path, f'map_file: {landmarks}, autosave_map: true, pose_file_max_age: 9'
         )
         arguments = ('replay', simulated, '--config', config)
         errors = slam_observer(*arguments).errors
@@ -97,8 +97,8 @@ class TestSettings:
         assert f'{names} are both' in slam_observer.fail('replay', simulated, *options)
 
     def test_angles_in_degrees(self, slam_observer, simulated):
-        for name, value in (('sensor_pose', '[0, 0, 0, 0, 0, 90]'), ('initial_yaw', '90')):
-            error = slam_observer.fail('replay', simulated, '--set', f'{name}={value}')
+        for name in ('sensor_pose', 'initial_pose'):
+            error = slam_observer.fail('replay', simulated, '--set', f'{name}=[0, 0, 0, 0, 0, 90]')
             assert f"'{name}'" in error
 
     def test_misspelt_name_in_the_file(self, slam_observer, simulated, tmp_path):

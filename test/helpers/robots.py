@@ -17,6 +17,15 @@ from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessa
 from slam_observer_ros.simulation import Simulation
 
 
+def reliable(namespace='', **policies):
+    """Return the parameters by which an observer hears a robot reliably, with more policies."""
+    return {
+        f'qos_overrides.{namespace}/{topic}.subscription.{policy}': value
+        for topic in ('twist', 'landmarks')
+        for policy, value in {'reliability': 'reliable', **policies}.items()
+    }
+
+
 class Robot:
     """Publishes events as a robot's sensors would."""
 

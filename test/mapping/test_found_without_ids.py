@@ -91,9 +91,9 @@ class TestWithoutIds:
 
     def test_a_start_may_be_known_but_for_the_heading(self):
         world = World(0, is_planar=True)
-        given = {'set_initial_pose': True, 'initial_position': tuple(world.start[:3, 3])}
-        deviations = {'initial_position_stddev': 0.0, 'initial_angle_stddev': 2.0}
-        estimator = Estimator(world.settings(**given, **deviations))
+        pose = (*world.start[:3, 3].tolist(), 0.0, 0.0, 0.0)
+        given = {'set_initial_pose': True, 'initial_pose': pose, 'initial_pose_stddev': (0.0, 2.0)}
+        estimator = Estimator(world.settings(**given))
         estimator.load_map(world.map())
         add(estimator, [without_ids(event) for event in world.drive(0.0, 3.0, count=8)])
         assert estimator.is_localised

@@ -201,8 +201,7 @@ class TestInitialPoseOfTheSettings:
         yaw = float(np.arctan2(world.start[1, 0], world.start[0, 0]))
         return world.settings(
             set_initial_pose=True,
-            initial_position=(x + offset_m, y - offset_m, 0.0),
-            initial_yaw=yaw + 0.1,
+            initial_pose=(x + offset_m, y - offset_m, 0.0, 0.0, 0.0, yaw + 0.1),
             **changes,
         )
 
@@ -224,7 +223,7 @@ class TestInitialPoseOfTheSettings:
         world = World(3, is_planar=True)
         settings = self.docked(world)
         estimator = add(Estimator(settings), [world.see(0.0, range(6))])
-        assert_array_equal(estimator.pose[:3, 3], settings.initial_position)
+        assert_array_equal(estimator.pose[:3, 3], settings.initial_pose[:3])
         assert_array_equal(estimator.pose_covariance, 0.0)
 
     def test_each_run_starts_there(self):
@@ -254,7 +253,8 @@ class TestInitialPoseOfTheSettings:
         for seed in range(5):
             world = World(seed, is_planar=True)
             settings = self.docked(world, offset_m, localization_mode=mode)
-            estimator = Estimator(replace(settings, initial_yaw=settings.initial_yaw + 1.0))
+            *others, yaw = settings.initial_pose
+            estimator = Estimator(replace(settings, initial_pose=(*others, yaw + 1.0)))
             known = world.map()
             estimator.load_map(known)
             add(estimator, world.drive(0.0, 5.0))
@@ -306,9 +306,9 @@ class TestInitialPoseOfTheSettings:
     @pytest.mark.parametrize(
         'given',
         [
-            {'initial_yaw': 0.5},
-            {'initial_position': (1.0, 0.0, 0.0)},
-            {'initial_position': (0.0, 0.0, -1.0)},
+            {'initial_pose': (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)},
+            {'initial_pose': (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)},
+            {'initial_pose': (0.0, 0.0, -1.0, 0.0, 0.0, 0.0)},
         ],
     )
     def test_one_that_is_not_asked_for_is_given_to_have_no_effect(self, given, caplog):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
-from robots import own_topics, Robot, stamp_ns
+from robots import own_topics, reliable, Robot, stamp_ns
 from sensor_msgs.msg import PointCloud2
 from tag_drives import past_tags, SETTINGS, STEP_NS
 
@@ -38,12 +38,10 @@ from slam_observer_ros.simulation import Scenario
 pytestmark = pytest.mark.ros
 
 SECOND = 1_000_000_000
-HEARING = {
-    'twist_qos': 'reliable',
-    'landmarks_qos': 'reliable',
-    'queue_depth': 1000,
-    'publish_rate': 200.0,
-}
+
+
+def hearing(namespace):
+    return {**reliable(namespace, depth=1000), 'publish_rate': 200.0}
 
 
 def as_received(event):
@@ -72,7 +70,7 @@ def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
     odometry = ros.collect(Odometry, '/replayed/observer_node/odometry')
     maps = ros.collect(PointCloud2, '/replayed/landmark_map', LATCHED_QOS)
     # A wide window, since a busy machine may deliver one topic well before the other.
-    parameters = HEARING | {'reorder_window': 1.0}
+    parameters = hearing('/replayed') | {'reorder_window': 1.0}
     with (
         running('observer_node', tmp_path / 'log', '-r', '__ns:=/replayed', **parameters),
         Robot(ros, namespace='/replayed') as robot,
@@ -214,8 +212,9 @@ def test_replay_of_tags_with_orientations_gives_the_same_bits(
     inputs = InputSettings(landmarks_type=landmarks_type, sensor_pose=CAMERA, odom_frame='')
     messages = drive_past(make_tags)
     end_ns, _, _ = messages[-1]
-    arguments, parameters = own_topics(namespace), changed(settings) | changed(inputs)
-    with running('observer_node', tmp_path / 'log', *arguments, **HEARING, **parameters):
+    arguments = own_topics(namespace)
+    parameters = hearing(namespace) | changed(settings) | changed(inputs)
+    with running('observer_node', tmp_path / 'log', *arguments, **parameters):
         publish(ros, namespace, messages, odometry)
         ros.spin_until(lambda: maps and stamp_ns(maps[-1]) == end_ns, 'the last map')
 

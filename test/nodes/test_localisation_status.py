@@ -19,9 +19,7 @@ from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.simulation import Scenario
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-SETTINGS = ObserverNodeSettings(
-    position_warn=0.1, position_error=0.3, heading_warn=0.05, heading_error=0.2
-)
+SETTINGS = ObserverNodeSettings(position_limits=(0.1, 0.3), heading_limits=(0.05, 0.2))
 
 
 class Watched:

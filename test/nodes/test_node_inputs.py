@@ -24,7 +24,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
-from robots import own_topics, Robot, stamp_ns, TransformSender
+from robots import own_topics, reliable, Robot, stamp_ns, TransformSender
 import ros_messages
 from sensor_msgs.msg import Imu, PointCloud2
 
@@ -670,7 +670,7 @@ def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_p
     maps = ros.collect(PointCloud2, '/picky/landmark_map', LATCHED_QOS)
     with (
         running(
-            'observer_node', tmp_path / 'log', *own_topics('/picky'), landmarks_qos='reliable'
+            'observer_node', tmp_path / 'log', *own_topics('/picky'), **reliable('/picky')
         ) as node,
         Robot(ros, namespace='/picky', subscribers=False) as robot,
     ):

@@ -459,7 +459,7 @@ def test_a_robot_that_starts_at_its_dock_is_placed_at_once(ros, robot, tmp_path)
     surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml')
     pose = se3.exp(np.array([0.0, 0.0, 0.5, -1.0, 2.0, 0.0]))
     x, y, z = (pose[:3, 3] + [0.1, -0.2, 0.0]).tolist()
-    dock = {'initial_position': f'[{x}, {y}, {z}]', 'initial_yaw': 0.4, 'set_initial_pose': True}
+    dock = {'initial_pose': f'[{x}, {y}, {z}, 0.0, 0.0, 0.4]', 'set_initial_pose': True}
     with running(
         'observer_node', tmp_path / 'log', map_file=surveyed, **dock, **PARAMETERS
     ) as node:

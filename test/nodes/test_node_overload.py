@@ -10,7 +10,7 @@ from nav_msgs.msg import Odometry
 from node_processes import running
 import numpy as np
 import pytest
-from robots import own_topics, Robot, stamp_ns, TransformSender
+from robots import own_topics, reliable, Robot, stamp_ns, TransformSender
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
@@ -26,7 +26,7 @@ QUEUED_S = 100 / 30
 """How old the output is where a full queue of clouds is waited for, seconds."""
 
 V = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])
-NONE_IS_LOST = {'twist_qos': 'reliable', 'queue_depth': 1000}
+NONE_IS_LOST = reliable('/loaded', depth=1000)
 """A busy machine may hold up the node for longer than its queue lasts by default, a second."""
 
 DEFAULT = {'landmarks_max_wait': ObserverNodeSettings.landmarks_max_wait, 'max_points': 1000}

@@ -18,7 +18,7 @@ from node_processes import running
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
-from robots import own_topics, pose_of, Robot, stamp_ns, TransformSender
+from robots import own_topics, pose_of, reliable, Robot, stamp_ns, TransformSender
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
@@ -78,9 +78,8 @@ def ids(maps):
 def test_paused_observer_holds_its_pose_and_counts_what_it_drops(ros, tmp_path):
     poses = ros.collect(PoseWithCovarianceStamped, '/paused/pose')
     diagnostics = Diagnostics(ros, '/paused')
-    reliable = {'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
     with (
-        running('observer_node', tmp_path / 'log', '-r', '__ns:=/paused', **reliable),
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/paused', **reliable('/paused')),
         Robot(ros, namespace='/paused') as robot,
     ):
         last_ns = max(event.stamp_ns for event in robot.run(RUN))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from rclpy.serialization import serialize_message
-from robots import own_topics, Robot, stamp_ns, TransformSender
+from robots import own_topics, reliable, Robot, stamp_ns, TransformSender
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
@@ -117,7 +117,7 @@ def test_a_recording_that_is_looped_without_a_pause_is_reset_once_and_loses_noth
     statuses = ros.collect(DiagnosticArray, '/diagnostics')
     own_clock = ros.node.create_publisher(Clock, f'{namespace}/clock', 100)
     arguments = ('-r', f'__ns:={namespace}', '-r', f'/clock:={namespace}/clock')
-    parameters = {'use_sim_time': True, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
+    parameters = {'use_sim_time': True, **reliable(namespace)}
     deliveries = list(Simulation(replace(RUN, duration=3.0), SECOND).deliveries())
     length_s, loops, sent = 3.0, 2, 0
     clocks = [(k * 0.025 + max(clock_late_s, 0.0), k * SECOND // 40) for k in range(120)]
@@ -409,14 +409,16 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
     orders = {'/ordered': events, '/shuffled': shuffled}
     end_ns = max(event.stamp_ns for event in events)
     # A wide window, since a busy machine may deliver one topic well before the other.
-    parameters = {'reorder_window': 1.0, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
+    parameters = {'reorder_window': 1.0}
     with ExitStack() as stack:
         maps, robots = {}, {}
         for name in orders:
             maps[name] = ros.collect(PointCloud2, f'{name}/landmark_map', LATCHED_QOS)
             arguments = ('-r', f'__ns:={name}')
             log = tmp_path / name.strip('/')
-            stack.enter_context(running('observer_node', log, *arguments, **parameters))
+            stack.enter_context(
+                running('observer_node', log, *arguments, **parameters, **reliable(name))
+            )
         for name in orders:
             robots[name] = stack.enter_context(Robot(ros, namespace=name))
         for pair in zip(*orders.values(), strict=True):

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.findings import Finding
@@ -53,9 +52,8 @@ def open_inputs(
     landmarks = _landmark_input(node, settings, feed)
     imu: list[InputTopic[Any]] = []
     if settings.use_imu:
-        qos = _qos(settings.twist_qos, settings.queue_depth)
         of_imu = decoders('angular velocity')
-        imu.append(InputTopic(node, 'imu', of_imu, partial(feed.add, 'imu'), qos))
+        imu.append(InputTopic(node, 'imu', of_imu, partial(feed.add, 'imu')))
     velocity.read_first, landmarks.read_first = imu, [velocity, *imu]
     return [velocity, landmarks, *imu]
 
@@ -63,7 +61,6 @@ def open_inputs(
 def _velocity_input(
     node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
 ) -> InputTopic[Any]:
-    qos = _qos(settings.twist_qos, settings.queue_depth)
     if settings.velocity_source == POSE_DIFFERENCES:
         if settings.velocity_type not in (AUTO, 'Odometry'):
             raise ParameterError(
@@ -75,7 +72,7 @@ def _velocity_input(
         chosen = _chosen('velocity', settings.velocity_type)
         if ODOMETRY in chosen:
             chosen[ODOMETRY] = OdometryDecoder(node, not settings.use_imu)
-    return InputTopic(node, 'twist', chosen, partial(feed.add, 'twist'), qos)
+    return InputTopic(node, 'twist', chosen, partial(feed.add, 'twist'))
 
 
 def _landmark_input(
@@ -93,8 +90,7 @@ def _landmark_input(
             chosen[cloud] = CloudDecoder(node, cloud)
         if not any(map(is_installed, chosen)):
             message_class(next(iter(chosen)))  # raises, and says what to install
-    qos = _qos(settings.landmarks_qos, settings.queue_depth)
-    topic = InputTopic(node, name, chosen, take, qos, settings.landmarks_max_wait)
+    topic = InputTopic(node, name, chosen, take, settings.landmarks_max_wait)
     topic.is_shared = True
     topic.advice = {
         message_type: f'landmarks_type: {known.short_name}'
@@ -110,14 +106,6 @@ def _chosen(role: Role, type_choice: str) -> dict[str, Any]:
         for name, known in message_types(role).items()
         if type_choice in (AUTO, known.short_name)
     }
-
-
-def _qos(reliability: str, depth: int) -> QoSProfile:
-    return QoSProfile(
-        reliability=ReliabilityPolicy[reliability.upper()],
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-    )
 
 
 MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero

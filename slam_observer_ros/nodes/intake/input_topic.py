@@ -11,7 +11,8 @@ import time
 from typing import Any, Generic, TypeVar
 
 from rclpy.node import Node
-from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
+from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -35,6 +36,9 @@ WELL_S = 1.0
 
 HELD_UP_S = 1.0
 """How long a node that should look at its topics four times a second must not have done so."""
+
+QUEUE_DEPTH = 100
+"""Messages of an input that are kept while the node is busy, unless qos_overrides say so."""
 
 MAX_FULL_NAMES = 3  # of message types in a log line
 
@@ -214,7 +218,6 @@ class InputTopic(Generic[MessageT]):
         one that comes on the topic.
     on_message : callable
         Called with each decoded message and the ROS time of its reception in nanoseconds.
-    qos : QoSProfile
     max_wait_s : float, optional
         How long messages may wait before only the newest of each sensor is used, seconds; by
         default all are used.
@@ -249,13 +252,13 @@ class InputTopic(Generic[MessageT]):
         name: str,
         decoders: Mapping[str, Decoder[MessageT]],
         on_message: Callable[[MessageT, int], None],
-        qos: QoSProfile,
         max_wait_s: float = math.inf,
     ) -> None:
         self._node = node
         self._decoders = decoders
         self._on_message = on_message
-        self._qos = qos
+        # Any publisher is heard, and of what waits while the node is busy the newest is kept.
+        self._qos = QoSProfile(depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.has_more = False
         self.is_shared = False
         self.advice: Mapping[str, str] = {}
@@ -409,9 +412,17 @@ class InputTopic(Generic[MessageT]):
     def _subscribe(self, type_name: str) -> None:
         kind = message_class(type_name)
         is_new = self._types.choose(type_name, time.monotonic())
-        self._subscription = self._node.create_subscription(
-            kind, self.topic, with_info(self._receive), self._qos, raw=True
-        )
+        try:
+            self._subscription = self._node.create_subscription(
+                kind,
+                self.topic,
+                with_info(self._receive),
+                self._qos,
+                raw=True,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+        except RuntimeError as error:  # as rclpy refuses a policy
+            raise ParameterError(f"'qos_overrides.{self.topic}.subscription': {error}") from error
         if is_new:
             self._node.get_logger().info(f"listening for {type_name} on '{self.topic}'")
 

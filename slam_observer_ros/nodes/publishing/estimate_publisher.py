@@ -37,6 +37,9 @@ from slam_observer_ros.nodes.ros_interface import (
 from slam_observer_ros.recordings.frames import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
+PATH_LENGTH = 2000
+"""Most poses kept in the path, 0.1 s apart or more; the oldest go first."""
+
 SLACK = 0.5
 """Part of the period by which a state of the input that sets the pace may come early, as inputs
 jitter, and by which other inputs wait for it."""
@@ -108,7 +111,7 @@ class EstimatePublisher:
         self._pace = Pace(settings.publish_rate)
         self._fast_stamp_ns: int | None = None
         self._slow_stamp_ns: int | None = None
-        self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
+        self._path: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
         self._path_stamp_ns: int | None = None
         self._odometry = node.create_publisher(Odometry, '~/odometry', RELIABLE_QOS)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', LATCHED_POSE_QOS)
