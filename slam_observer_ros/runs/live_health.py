@@ -145,12 +145,9 @@ def localisation(
     return worst, '; '.join(reasons) or 'localised'
 
 
-def of_publishers(topic: str, names: Sequence[str]) -> Finding | None:
-    """Report who publishes on a topic, if more than one does; else None."""
-    if len(names) < 2:
-        return None
-    listed = ', '.join(sorted(names))
-    return found('several_publishers', count=len(names), names=listed, topic=topic)
+def of_publishers(topic: str, names: Sequence[str]) -> Finding:
+    """Report that several nodes publish on a topic."""
+    return found('several_publishers', count=len(names), names=', '.join(names), topic=topic)
 
 
 def of_types(topic: str, heard: str, others: str) -> Finding:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.findings import Finding
@@ -43,6 +44,9 @@ from slam_observer_ros.settings.input_settings import (
 )
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
+QUEUE_DEPTH = 100
+"""Messages of an input that are kept while the node is busy."""
+
 
 def open_inputs(
     node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
@@ -53,7 +57,7 @@ def open_inputs(
     imu: list[InputTopic[Any]] = []
     if settings.use_imu:
         of_imu = decoders('angular velocity')
-        imu.append(InputTopic(node, 'imu', of_imu, partial(feed.add, 'imu')))
+        imu.append(InputTopic(node, 'imu', of_imu, partial(feed.add, 'imu'), _qos()))
     velocity.read_first, landmarks.read_first = imu, [velocity, *imu]
     return [velocity, landmarks, *imu]
 
@@ -72,7 +76,7 @@ def _velocity_input(
         chosen = _chosen('velocity', settings.velocity_type)
         if ODOMETRY in chosen:
             chosen[ODOMETRY] = OdometryDecoder(node, not settings.use_imu)
-    return InputTopic(node, 'twist', chosen, partial(feed.add, 'twist'))
+    return InputTopic(node, 'twist', chosen, partial(feed.add, 'twist'), _qos())
 
 
 def _landmark_input(
@@ -90,7 +94,7 @@ def _landmark_input(
             chosen[cloud] = CloudDecoder(node, cloud)
         if not any(map(is_installed, chosen)):
             message_class(next(iter(chosen)))  # raises, and says what to install
-    topic = InputTopic(node, name, chosen, take, settings.landmarks_max_wait)
+    topic = InputTopic(node, name, chosen, take, _qos(), settings.landmarks_max_wait)
     topic.is_shared = True
     topic.advice = {
         message_type: f'landmarks_type: {known.short_name}'
@@ -106,6 +110,11 @@ def _chosen(role: Role, type_choice: str) -> dict[str, Any]:
         for name, known in message_types(role).items()
         if type_choice in (AUTO, known.short_name)
     }
+
+
+def _qos() -> QoSProfile:
+    """Return a profile by which any publisher is heard."""
+    return QoSProfile(depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero

@@ -11,7 +11,7 @@ import time
 from typing import Any, Generic, TypeVar
 
 from rclpy.node import Node
-from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile, ReliabilityPolicy
+from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -37,9 +37,6 @@ WELL_S = 1.0
 HELD_UP_S = 1.0
 """How long a node that should look at its topics four times a second must not have done so."""
 
-QUEUE_DEPTH = 100
-"""Messages of an input that are kept while the node is busy, unless qos_overrides say so."""
-
 MAX_FULL_NAMES = 3  # of message types in a log line
 
 MessageT = TypeVar('MessageT')
@@ -48,9 +45,10 @@ Decoder = Callable[[Buffer, int], MessageT]
 
 def rivals(topic: str, publishers: Sequence[TopicEndpointInfo]) -> Finding | None:
     """Report who publishes on a topic, if more than one does; else None."""
-    return of_publishers(
-        topic, [f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers]
-    )
+    if len(publishers) < 2:
+        return None
+    names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
+    return of_publishers(topic, names)
 
 
 def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
@@ -218,6 +216,8 @@ class InputTopic(Generic[MessageT]):
         one that comes on the topic.
     on_message : callable
         Called with each decoded message and the ROS time of its reception in nanoseconds.
+    qos : QoSProfile
+        As parameters ``qos_overrides`` of ROS may change it.
     max_wait_s : float, optional
         How long messages may wait before only the newest of each sensor is used, seconds; by
         default all are used.
@@ -252,13 +252,13 @@ class InputTopic(Generic[MessageT]):
         name: str,
         decoders: Mapping[str, Decoder[MessageT]],
         on_message: Callable[[MessageT, int], None],
+        qos: QoSProfile,
         max_wait_s: float = math.inf,
     ) -> None:
         self._node = node
         self._decoders = decoders
         self._on_message = on_message
-        # Any publisher is heard, and of what waits while the node is busy the newest is kept.
-        self._qos = QoSProfile(depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._qos = qos
         self.has_more = False
         self.is_shared = False
         self.advice: Mapping[str, str] = {}
