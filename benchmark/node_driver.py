@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.cdr import CdrReader
-from slam_observer_ros.nodes.ros_interface import MESSAGES
+from slam_observer_ros.nodes.ros_node import MESSAGES
 
 RELIABLE = QoSProfile(depth=100)
 TICK_S = 1.0 / TICK_HZ

@@ -24,7 +24,7 @@ from slam_observer_ros.messages.poses import (
     decode_pose_stamped,
     decode_pose_with_covariance_stamped,
 )
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, TFMessage
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, TFMessage
 from slam_observer_ros.recordings.trajectory import associate, Trajectory
 from slam_observer_ros.recordings.writer import RecordingWriter
 

@@ -20,7 +20,7 @@ from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import RANGE, UNKNOWN_ID
 from slam_observer_ros.messages.poses import pose_matrices
-from slam_observer_ros.nodes.ros_interface import MESSAGES
+from slam_observer_ros.nodes.ros_node import MESSAGES
 
 START_NS = 1_000_000_000  # a simulated /clock of zero means that there is no time yet
 ODOMETRY_HZ = 50

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, Final, TextIO
 
 import yaml
 
-from slam_observer_ros.common.errors import shown, YamlError
+from slam_observer_ros.common.errors import ParameterError, shown, YamlError
 
 _UTF16_MARKS = (b'\xff\xfe', b'\xfe\xff')
 
@@ -66,6 +66,24 @@ def checked_name(path: Path) -> Path:
     except UnicodeEncodeError:
         pass
     raise OSError(errno.EINVAL, 'no file can have this name', str(path))
+
+
+def is_there(path: Path) -> bool:
+    """Return whether there is such a file, as far as one may look."""
+    try:
+        return path.exists()
+    except OSError:  # its name is too long, for example
+        return False
+
+
+def absolute(path: str) -> Path:
+    """Return a path with ~ expanded; ParameterError where there is no such user, or file name."""
+    try:
+        return checked_name(Path(path).expanduser().absolute())
+    except RuntimeError as error:  # of a user that there is none of
+        raise ParameterError(f"can't find {path}: {error}") from error
+    except OSError as error:
+        raise ParameterError(f"can't find {path!r}: {error.strerror}") from error
 
 
 def destination(path: Path) -> Path:

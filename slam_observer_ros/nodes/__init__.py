@@ -2,8 +2,6 @@
 
 ``executables`` wait for signals from the first instant (``common/process``), then load a node and
 give it to ``runner``. ``observer_nodes`` has the observer, plain and managed: shells around
-``observer_core``, where what comes in (``intake/``) goes through the estimator to what goes out
-(``publishing/``); ``control_services``, ``map_services`` and ``initial_pose`` steer it.
-``simulator`` is the paper's simulation. Used by all: ``ros_interface``, and ``guarded_node`` (what
-callbacks raise and nodes log, and what a managed node destroys again).
+``observer_core``, where what comes in goes through the estimator to what goes out; ``services``
+and ``initial_pose`` steer it. ``simulator`` is the paper's simulation. All use ``ros_node``.
 """

@@ -20,7 +20,13 @@ from slam_observer_ros.common.errors import (
     SlamObserverError,
     YamlError,
 )
-from slam_observer_ros.common.files import load_yaml, plain_value, unfinished_file
+from slam_observer_ros.common.files import (
+    absolute,
+    is_there,
+    load_yaml,
+    plain_value,
+    unfinished_file,
+)
 from slam_observer_ros.common.stamps import is_of_1970, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
@@ -29,10 +35,8 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import are_covariances, limited
 from slam_observer_ros.mapping.landmark_map import MAX_NUMBER
 from slam_observer_ros.messages.poses import decode_pose_with_covariance_stamped, PoseMessage
-from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
-from slam_observer_ros.nodes.map_services import absolute, is_there
-from slam_observer_ros.nodes.ros_interface import RELIABLE_QOS
+from slam_observer_ros.nodes.ros_node import RELIABLE_QOS, ThrottledLog
+from slam_observer_ros.nodes.transforms import TransformedOdometry
 from slam_observer_ros.runs.live_health import FUTURE_NS
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

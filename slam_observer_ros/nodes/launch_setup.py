@@ -8,7 +8,7 @@ from typing import Any
 
 from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 
-from slam_observer_ros.nodes.ros_interface import install_command
+from slam_observer_ros.nodes.ros_node import install_command
 
 
 def check_file(context: Any, name: str, may_be_folder: bool = False) -> None:

@@ -21,7 +21,7 @@ from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.detections import observed_tags
 from slam_observer_ros.messages.poses import decode_transforms, TRANSFORMS
-from slam_observer_ros.nodes.ros_interface import message_class
+from slam_observer_ros.nodes.ros_node import message_class
 from slam_observer_ros.settings.input_settings import (
     InputSettings,
     message_types,

@@ -18,19 +18,20 @@ from rclpy.timer import Timer
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.nodes.control_services import ControlServices
-from slam_observer_ros.nodes.guarded_node import Entities, GuardedNode, ThrottledLog
+from slam_observer_ros.nodes.chosen_inputs import open_inputs
+from slam_observer_ros.nodes.diagnostics import (
+    DiagnosticsPublisher,
+    LocalisationStatus,
+    MistakeWatch,
+    NoiseFit,
+)
+from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher, TOPICS
+from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.initial_pose import InitialPoseListener, KeptPose
-from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
-from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
-from slam_observer_ros.nodes.intake.input_topic import InputTopic
-from slam_observer_ros.nodes.intake.transforms import LiveTransforms, TransformedOdometry
-from slam_observer_ros.nodes.map_services import MapServices, NamedMapServices
-from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
-from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
-from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
-from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
-from slam_observer_ros.nodes.ros_interface import read_settings
+from slam_observer_ros.nodes.input_topic import InputTopic
+from slam_observer_ros.nodes.ros_node import Entities, GuardedNode, read_settings, ThrottledLog
+from slam_observer_ros.nodes.services import ControlServices, MapServices, NamedMapServices
+from slam_observer_ros.nodes.transforms import LiveTransforms, TransformedOdometry
 from slam_observer_ros.recordings.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.runs.mistakes import Search
 from slam_observer_ros.settings.estimator_settings import Settings

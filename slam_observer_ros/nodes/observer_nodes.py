@@ -10,10 +10,11 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from slam_observer_ros.common.errors import ParameterError, SlamObserverError
-from slam_observer_ros.nodes.guarded_node import Entities, forward_logging
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.ros_interface import (
+from slam_observer_ros.nodes.ros_node import (
     declare_settings,
+    Entities,
+    forward_logging,
     install_command,
     read_settings,
     RepeatableParameters,

@@ -13,15 +13,15 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.publishing.pose_broadcaster import TransformPublisher
-from slam_observer_ros.nodes.ros_interface import (
+from slam_observer_ros.nodes.ros_node import (
     declare_settings,
     LATCHED_QOS,
     MESSAGES,
     read_settings,
     RepeatableParameters,
+    ThrottledLog,
 )
+from slam_observer_ros.nodes.transforms import TransformPublisher
 from slam_observer_ros.recordings.trajectory import PoseTruth
 from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation

@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median_low
+from typing import Any
 
 from slam_observer_ros.common.findings import fault, Finding, found, Level
 from slam_observer_ros.common.stamps import is_of_1970, to_s
@@ -145,8 +146,11 @@ def localisation(
     return worst, '; '.join(reasons) or 'localised'
 
 
-def of_publishers(topic: str, names: Sequence[str]) -> Finding:
-    """Report that several nodes publish on a topic."""
+def of_publishers(topic: str, publishers: Sequence[Any]) -> Finding | None:
+    """Report who publishes on a topic, by rclpy's TopicEndpointInfo, if more than one does."""
+    if len(publishers) < 2:
+        return None
+    names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
     return found('several_publishers', count=len(names), names=', '.join(names), topic=topic)
 
 

@@ -12,7 +12,7 @@ from tf2_msgs.msg import TFMessage
 
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.nodes.live_inputs import HeardTopic
-from slam_observer_ros.nodes.ros_interface import MESSAGES
+from slam_observer_ros.nodes.ros_node import MESSAGES
 
 pytestmark = pytest.mark.ros
 

@@ -17,7 +17,7 @@ from robot_report import Interruption
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.lie import se3
-from slam_observer_ros.nodes.ros_interface import TFMessage
+from slam_observer_ros.nodes.ros_node import TFMessage
 from slam_observer_ros.runs.health import of_mounting
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file

@@ -13,7 +13,7 @@ from slam_observer_ros.common.stamps import AGREEING_STAMPS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.messages.poses import pose_matrices
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.simulation import Simulation
 
 

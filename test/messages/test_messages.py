@@ -595,7 +595,7 @@ def test_a_message_that_is_made_leaves_the_one_before_as_it_is():
 def test_rclpy_serialises_the_same_bytes():
     """What rosbags' serialiser stands for here is what the middleware really sends."""
     serialization = pytest.importorskip('rclpy.serialization')
-    from slam_observer_ros.nodes.ros_interface import MESSAGES
+    from slam_observer_ros.nodes.ros_node import MESSAGES
 
     messages_of_rclpy = outgoing_messages(MESSAGES)
     for message, recorded in zip(messages_of_rclpy, outgoing_messages(ros.OUTGOING), strict=True):

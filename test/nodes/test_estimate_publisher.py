@@ -13,7 +13,7 @@ import pytest
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
+from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher
 from slam_observer_ros.recordings.frames import TransformBuffer
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

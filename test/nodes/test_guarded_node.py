@@ -17,8 +17,8 @@ from robots import Robot
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
-from slam_observer_ros.nodes.guarded_node import _refusal, Entities, GuardedNode
 from slam_observer_ros.nodes.observer_nodes import LifecycleObserverNode
+from slam_observer_ros.nodes.ros_node import _refusal, Entities, GuardedNode
 from slam_observer_ros.nodes.runner import _executor, turn
 from slam_observer_ros.simulation import Scenario
 
@@ -31,8 +31,8 @@ from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.observer_core import ObserverCore
 from slam_observer_ros.nodes.executables import observer_node
-from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
-from slam_observer_ros.nodes.control_services import ControlServices
+from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher
+from slam_observer_ros.nodes.services import ControlServices
 
 def fail(*_):
     raise np.linalg.LinAlgError('singular matrix')

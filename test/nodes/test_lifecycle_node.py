@@ -18,7 +18,7 @@ from robots import own_topics, Robot, stamp_ns
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.nodes.observer_nodes import LifecycleBond
-from slam_observer_ros.nodes.ros_interface import TFMessage
+from slam_observer_ros.nodes.ros_node import TFMessage
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros

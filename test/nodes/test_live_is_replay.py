@@ -25,7 +25,7 @@ from slam_observer_ros.messages.estimate_messages import (
     StateMessages,
     uncertain_pose,
 )
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import TopicNames
 from slam_observer_ros.recordings.writer import RecordingWriter

@@ -13,8 +13,8 @@ from robots import Robot
 from std_msgs.msg import Bool
 
 from slam_observer_ros.estimates import NormalisedInnovation
-from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS
+from slam_observer_ros.nodes.diagnostics import LocalisationStatus, NoiseFit
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.simulation import Scenario
 

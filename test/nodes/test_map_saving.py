@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.mapping.map_file import read_map
-from slam_observer_ros.nodes.map_services import END_S, MapServices
+from slam_observer_ros.nodes.services import END_S, MapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -12,7 +12,7 @@ import pytest
 from robots import Robot
 
 from slam_observer_ros.common.findings import found
-from slam_observer_ros.nodes.publishing.mistake_watch import MistakeWatch
+from slam_observer_ros.nodes.diagnostics import MistakeWatch
 from slam_observer_ros.runs.mistakes import Search
 
 SLIP = [found('slip')]

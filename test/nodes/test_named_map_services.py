@@ -11,7 +11,7 @@ import pytest
 
 from slam_observer_ros import Estimator, LandmarkMap, Settings
 from slam_observer_ros.mapping.map_file import read_map, write_map
-from slam_observer_ros.nodes.map_services import MapServices, NamedMapServices, path_of
+from slam_observer_ros.nodes.services import MapServices, NamedMapServices, path_of
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 HALL = LandmarkMap(np.array([3, 4]), np.array([[1.0, 2, 0], [4, 0, 0]]), None, np.ones(2, int))

@@ -25,8 +25,8 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import pose_matrices
-from slam_observer_ros.nodes.intake.transforms import LiveTransforms
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES
+from slam_observer_ros.nodes.transforms import LiveTransforms
 from slam_observer_ros.recordings.frames import TransformBuffer
 from slam_observer_ros.recordings.trajectory import PoseTruth
 from slam_observer_ros.simulation import Scenario, Simulation

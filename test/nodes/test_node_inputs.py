@@ -35,10 +35,10 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses import decode_twist, ODOMETRY
-from slam_observer_ros.nodes.intake import chosen_inputs
-from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
-from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes import chosen_inputs
+from slam_observer_ros.nodes.chosen_inputs import open_inputs
+from slam_observer_ros.nodes.input_topic import InputTopic
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES, TFMessage, with_info
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 IMU = 'sensor_msgs/msg/Imu'

@@ -30,9 +30,9 @@ from slam_observer_ros.mapping.map_file import read_map
 from slam_observer_ros.messages.estimate_messages import StateMessages, uncertain_pose
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.initial_pose import filled_in, InitialPoseListener
-from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
 from slam_observer_ros.nodes.observer_nodes import ObserverNode
-from slam_observer_ros.nodes.ros_interface import MESSAGES
+from slam_observer_ros.nodes.ros_node import MESSAGES
+from slam_observer_ros.nodes.transforms import TransformedOdometry
 from slam_observer_ros.recordings.frames import TransformBuffer
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

@@ -14,8 +14,8 @@ from robots import own_topics, reliable, Robot, stamp_ns, TransformSender
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
-from slam_observer_ros.nodes.intake.input_topic import LoadShedding, Waiting
-from slam_observer_ros.nodes.ros_interface import TFMessage
+from slam_observer_ros.nodes.input_topic import LoadShedding, Waiting
+from slam_observer_ros.nodes.ros_node import TFMessage
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 pytestmark = pytest.mark.ros

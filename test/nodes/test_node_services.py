@@ -29,9 +29,9 @@ from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import decode_point_cloud2
-from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
-from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes import diagnostics as node_diagnostics
+from slam_observer_ros.nodes.diagnostics import DiagnosticsPublisher
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.runs.health import of_calibration
 from slam_observer_ros.runs.live_health import MANY_UNUSED
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -15,7 +15,7 @@ import pytest
 from sensor_msgs.msg import PointCloud2
 
 from slam_observer_ros.mapping.map_file import read_map
-from slam_observer_ros.nodes.ros_interface import MESSAGES
+from slam_observer_ros.nodes.ros_node import MESSAGES
 
 pytestmark = pytest.mark.ros
 

@@ -26,8 +26,8 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
-from slam_observer_ros.nodes.intake.estimator_feed import ClockChange, EstimatorFeed, MAX_LOOKS
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES, TFMessage
+from slam_observer_ros.nodes.estimator_feed import ClockChange, EstimatorFeed, MAX_LOOKS
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.recordings.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings

@@ -32,9 +32,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes.observer_nodes import LifecycleObserverNode, ObserverNode
-from slam_observer_ros.nodes.publishing.pose_broadcaster import DISCOVERY_S
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS, MESSAGES
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES
 from slam_observer_ros.nodes.simulator import SimulatorNode
+from slam_observer_ros.nodes.transforms import DISCOVERY_S
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros

@@ -9,8 +9,8 @@ import pytest
 from slam_observer_ros import Estimator, Settings
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
-from slam_observer_ros.nodes.control_services import PausedMotion
-from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
+from slam_observer_ros.nodes.services import PausedMotion
+from slam_observer_ros.nodes.transforms import TransformedOdometry
 from slam_observer_ros.recordings.frames import TransformBuffer
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message
 from robots import pose_of, stamp_ns
 
 from slam_observer_ros.lie import se3
-from slam_observer_ros.nodes.publishing.pose_broadcaster import (
+from slam_observer_ros.nodes.transforms import (
     DISCOVERY_S,
     MAX_WAITING_NS,
     PoseBroadcaster,

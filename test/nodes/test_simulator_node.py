@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud, decode_point_cloud2
 from slam_observer_ros.messages.poses import decode_pose_stamped
-from slam_observer_ros.nodes.ros_interface import LATCHED_QOS
+from slam_observer_ros.nodes.ros_node import LATCHED_QOS
 
 pytestmark = pytest.mark.ros
 

@@ -21,7 +21,7 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.messages.clouds import scan_problem
-from slam_observer_ros.nodes.guarded_node import described, ThrottledLog
+from slam_observer_ros.nodes.ros_node import described, ThrottledLog
 from slam_observer_ros.recordings.event_builder import (
     drop_reason,
     DropError,

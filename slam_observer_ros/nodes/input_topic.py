@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from inspect import signature
 import math
 import time
 from typing import Any, Generic, TypeVar
@@ -21,8 +20,13 @@ from slam_observer_ros.common.findings import fault, Finding
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.ros_interface import is_installed, message_class
+from slam_observer_ros.nodes.ros_node import (
+    is_installed,
+    message_class,
+    take,
+    ThrottledLog,
+    with_info,
+)
 from slam_observer_ros.runs.live_health import Backlog, of_publishers, of_types, overload
 
 DISCOVERY_S = 5.0
@@ -41,37 +45,6 @@ MAX_FULL_NAMES = 3  # of message types in a log line
 
 MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
-
-
-def rivals(topic: str, publishers: Sequence[TopicEndpointInfo]) -> Finding | None:
-    """Report who publishes on a topic, if more than one does; else None."""
-    if len(publishers) < 2:
-        return None
-    names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
-    return of_publishers(topic, names)
-
-
-def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
-    """Take the next raw message that waits, with what DDS knows of it; None if there is none."""
-    with subscription.handle:
-        taken: tuple[bytes, Mapping[str, int]] | None = subscription.handle.take_message(
-            subscription.msg_type, subscription.raw
-        )
-    return taken
-
-
-def with_info(receive: Callable[[bytes, Mapping[str, int]], None]) -> Callable[..., None]:
-    """Return a callback that gets a message with what DDS knows of it from every executor.
-
-    EventsExecutor gives both as one argument, in rclpy 7.1 at least.
-    """
-
-    def callback(*taken: Any) -> None:
-        receive(*(taken[0] if len(taken) == 1 else taken))
-
-    # By which rclpy sees that the callback wants both.
-    callback.__signature__ = signature(receive)  # type: ignore[attr-defined]
-    return callback
 
 
 TRY_S = 2.0
@@ -344,7 +317,7 @@ class InputTopic(Generic[MessageT]):
         self._fault = missing or self._find_fault(publishers, usable)
         # Where they publish several types, the finding of that names the cause.
         is_shared = self.is_shared or self._several_types is not None
-        self._rivals = None if is_shared else rivals(self.topic, publishers)
+        self._rivals = None if is_shared else of_publishers(self.topic, publishers)
         # A robot that is parked may be silent for days.
         is_silent = bool(self.received and not self._fault and self.silent_s > DISCOVERY_S)
         silence = self.received, self._clock_stands

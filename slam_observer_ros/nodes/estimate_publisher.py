@@ -25,16 +25,16 @@ from slam_observer_ros.messages.estimate_messages import (
     uncertain_pose,
 )
 from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.nodes.guarded_node import ThrottledLog
-from slam_observer_ros.nodes.intake.input_topic import rivals
-from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
-from slam_observer_ros.nodes.ros_interface import (
+from slam_observer_ros.nodes.ros_node import (
     LATCHED_POSE_QOS,
     LATCHED_QOS,
     MESSAGES,
     RELIABLE_QOS,
+    ThrottledLog,
 )
+from slam_observer_ros.nodes.transforms import PoseBroadcaster
 from slam_observer_ros.recordings.frames import ALWAYS_NS, TransformBuffer
+from slam_observer_ros.runs.live_health import of_publishers
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 PATH_LENGTH = 2000
@@ -160,7 +160,7 @@ class EstimatePublisher:
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""
         topic = self._node.resolve_topic_name('~/odometry')
-        finding = rivals(topic, self._node.get_publishers_info_by_topic(topic))
+        finding = of_publishers(topic, self._node.get_publishers_info_by_topic(topic))
         if finding is None:
             return ''
         self._log.warning(topic, finding.text())

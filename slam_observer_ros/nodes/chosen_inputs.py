@@ -30,9 +30,9 @@ from slam_observer_ros.messages.poses import (
     TRANSFORMS,
 )
 from slam_observer_ros.messages.registry import Decode, decoders
-from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
-from slam_observer_ros.nodes.intake.input_topic import InputTopic
-from slam_observer_ros.nodes.ros_interface import is_installed, message_class
+from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
+from slam_observer_ros.nodes.input_topic import InputTopic
+from slam_observer_ros.nodes.ros_node import is_installed, message_class
 from slam_observer_ros.recordings.odometry import OdometryCheck
 from slam_observer_ros.runs.live_health import of_twist
 from slam_observer_ros.settings.input_settings import (

@@ -1,0 +1,389 @@
+"""The observer's health: /diagnostics, ~/is_localised, and a search for mistakes of the set-up."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
+import time
+from typing import Any, Protocol, TypeAlias
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
+from rclpy.node import Node
+from std_msgs.msg import Bool
+
+from slam_observer_ros.common.findings import Finding, in_brief, Level, worst_first
+from slam_observer_ros.common.stamps import to_ns
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimator.estimate import Estimate
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import Event
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher
+from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
+from slam_observer_ros.nodes.input_topic import InputTopic
+from slam_observer_ros.nodes.ros_node import GuardedNode, LATCHED_QOS, ThrottledLog
+from slam_observer_ros.runs.corrections import driven_s, explained, ODOMETRY_CAUSES, SUSPICIOUS
+from slam_observer_ros.runs.health import estimator_values, of_all_learnt, of_fit
+from slam_observer_ros.runs.live_health import InputNumbers, localisation, of_node, Progress
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+RECENT_INNOVATIONS = (
+    300  # observations over which innovations are compared with the noise that is stated
+)
+MIN_DEGREES = 100  # of freedom, that it takes to say so; the factor is then known to 7 %
+FOUND_AGAIN = 0.8  # of the error level: near it the robot would be lost and found all the time
+
+
+class NoiseFit:
+    """Compares the innovations of late with the noise that is stated."""
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[float, int]] = deque(maxlen=RECENT_INNOVATIONS)
+
+    def add(self, update: Update) -> None:
+        """Count an observation, if the gains know what was to be expected of it."""
+        innovation = update.innovation
+        if innovation is not None and innovation.nis is not None:
+            self._recent.append((innovation.nis, innovation.degrees_of_freedom))
+
+    @property
+    def factor(self) -> float | None:
+        """How many times as large as stated innovations are; None while that is not known."""
+        degrees = sum(each for _, each in self._recent)
+        if degrees < MIN_DEGREES:
+            return None
+        return float(np.sqrt(sum(nis for nis, _ in self._recent) / degrees))
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What is wrong with the noise that is stated."""
+        return of_fit(self.factor)
+
+    def __str__(self) -> str:
+        """Return the factor, and what is wrong with the noise by it."""
+        if self.factor is None:
+            return 'not known yet'
+        return f'{self.factor:.2f}' + ''.join(f' ({each.what})' for each in self.findings)
+
+
+class LocalisationStatus:
+    """Judges the standard deviations of position and heading; publishes ``~/is_localised``."""
+
+    def __init__(
+        self, node: Node, settings: ObserverNodeSettings, estimator: Estimate, noise: NoiseFit
+    ) -> None:
+        self._node = node
+        self._settings = settings
+        self._estimator = estimator
+        self._noise = noise
+        self._log = ThrottledLog(node)
+        self._is_localised: bool | None = None
+        self._was_localised = False
+        self._publisher = node.create_publisher(Bool, '~/is_localised', LATCHED_QOS)
+
+    def publish(self) -> None:
+        """Publish, and log, whether the robot is localised, if that has changed."""
+        share = FOUND_AGAIN if self._is_localised is False else 1.0
+        level, message = localisation(self._estimator, self._settings, self._deviations(), share)
+        is_localised = level < Level.ERROR and self._estimator.stamp_ns is not None
+        if is_localised == self._is_localised:
+            return
+        if self._is_localised:
+            self._log.warning('lost', f'not localised any more: {message}')
+        elif self._was_localised:
+            self._log.info('found', 'localised again')
+        self._is_localised = is_localised
+        self._was_localised |= is_localised
+        self._publisher.publish(Bool(data=is_localised))
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What is wrong with the noise that is stated."""
+        return self._noise.findings
+
+    def status(self, hardware_id: str, findings: Iterable[Finding]) -> DiagnosticStatus:
+        """Return the status for /diagnostics, with those findings that nothing else explains."""
+        deviations = self._deviations()
+        level, message = localisation(self._estimator, self._settings, deviations)
+        for finding in findings:
+            if finding.level >= Level.WARNING:
+                level = max(level, Level.WARNING)
+                message = f'{message}; {finding.what}'
+        known = ('unknown', 'unknown') if deviations is None else [f'{d:.3f}' for d in deviations]
+        values = {
+            'map': self._estimator.map_name or 'none',
+            'position, standard deviation [m]': known[0],
+            'heading, standard deviation [rad]': known[1],
+            'innovations / stated noise': str(self._noise),
+        }
+        return DiagnosticStatus(
+            level=bytes([level]),
+            name=f'{self._node.get_fully_qualified_name().lstrip("/")}: localisation',
+            hardware_id=hardware_id,
+            message=message,
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+
+    def _deviations(self) -> tuple[float, float] | None:
+        """Return standard deviations of position, m, and heading, rad; None if not known."""
+        if self._estimator.stamp_ns is None:
+            return None
+        covariance = self._estimator.pose_covariance
+        return None if covariance is None else deviations(covariance)
+
+
+def deviations(covariance: FloatArray) -> tuple[float, float]:
+    """Return standard deviations of position, in its worst direction, m, and of heading, rad.
+
+    ``covariance`` (6, 6) has rotation vector and position along the map's axes; both are
+    infinite if it is not finite.
+    """
+    if not np.isfinite(covariance).all():
+        return np.inf, np.inf
+    position_m2 = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+    return float(np.sqrt(max(position_m2, 0.0))), float(np.sqrt(max(covariance[2, 2], 0.0)))
+
+
+WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000
+"""Time, and events, of late that are looked at."""
+
+LEAST_DRIVEN_S = 20.0
+"""Driving that says something; the most that a search may then take is left of a minute."""
+
+PERIOD_S, SLICE_S = 0.05, 0.01
+"""How often a search goes on, and for how long, so that no message waits for it."""
+
+PAUSE_S = 60.0
+"""Time between two searches: before, most of the events are the same."""
+
+
+class Slices(Protocol):
+    """Looks for mistakes of a set-up, a part at a time (``runs/mistakes.py``)."""
+
+    findings: list[Finding]
+
+    def advance(self, seconds: float) -> bool:
+        """Go on for some time; return whether ``findings`` are known."""
+
+
+Begin: TypeAlias = Callable[[Settings, Sequence[Event], Sequence[LandmarkMap] | None], Slices]
+
+
+class MistakeWatch:
+    """Keeps the events of late, and searches them for a mistake while there is reason for that.
+
+    Attributes
+    ----------
+    findings : list of Finding
+        What the last search has named.
+    timer : Timer
+        It runs only while a search goes on.
+
+    """
+
+    def __init__(self, node: Node, estimator: Estimate, begin_search: Begin) -> None:
+        self.findings: list[Finding] = []
+        self._node = node
+        self._estimator, self._begin_search = estimator, begin_search
+        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._search: Slices | None = None
+        self._next_s = 0.0
+        self.timer = node.create_steady_timer(PERIOD_S, self._advance)
+        self.timer.cancel()
+
+    def note(self, event: Event) -> None:
+        """Keep an event as the estimator gets it."""
+        self._events.append(event)
+        while self._events[0].stamp_ns < event.stamp_ns - WINDOW_NS:
+            self._events.popleft()
+
+    def clear(self) -> None:
+        """Forget what was of another time."""
+        self._events.clear()
+        self._search = None
+
+    def look(self, findings: Iterable[Finding], has_slipped: bool) -> None:
+        """Begin to search if what was found, or named before, is reason for that."""
+        if self._search is not None or time.monotonic() < self._next_s:
+            return
+        is_suspicious = has_slipped or any(each.kind in SUSPICIOUS for each in findings)
+        if (is_suspicious or self.findings) and driven_s(self._events) > LEAST_DRIVEN_S:
+            maps = self._estimator.loaded_maps
+            self._search = self._begin_search(
+                self._estimator.settings, list(self._events), maps or None
+            )
+            self.timer.reset()
+
+    def _advance(self) -> None:
+        if self._search is not None and self._search.advance(SLICE_S):
+            before = {finding.kind for finding in self.findings}
+            self.findings, self._search = self._search.findings, None
+            self._next_s = time.monotonic() + PAUSE_S
+            for finding in self.findings:
+                if finding.kind not in before:
+                    self._node.get_logger().error(finding.text())
+        if self._search is None:
+            self.timer.cancel()
+
+
+RECENT = 30  # statuses, of about a second each, over which rejected points are counted
+
+
+class DiagnosticsPublisher:
+    """Publishes what comes in, what is dropped and why, on ``/diagnostics``."""
+
+    def __init__(
+        self,
+        node: GuardedNode,
+        estimator: Estimator,
+        feed: EstimatorFeed,
+        inputs: Sequence[InputTopic[Any]],
+        estimate_publisher: EstimatePublisher,
+        localisation: LocalisationStatus,
+        watch: MistakeWatch,
+        hardware_id: str,
+    ) -> None:
+        self._node = node
+        self._hardware_id = hardware_id
+        self._estimator = estimator
+        self._feed = feed
+        self._inputs = inputs
+        self._estimate_publisher = estimate_publisher
+        self._localisation = localisation
+        self._watch = watch
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._last_time_s = time.monotonic()
+        self._seen_s: float | None = None  # when a landmark was seen last
+        self._said_empty = False
+        self._since_s: dict[str, float] = {}  # when what is wrong was found first
+        self._last_received = {source.topic: 0 for source in inputs}
+        self._last_dropped: Counter[str] = Counter()
+        self._last_malformed: Counter[str] = Counter()
+        self._last_unstamped: Counter[str] = Counter()
+        self._last_counts: Counter[str] = Counter()
+        self._recent_counts: deque[Counter[str]] = deque(maxlen=RECENT)
+
+    def publish(self) -> None:
+        """Publish the status of the estimate and of the localisation, about once a second."""
+        dropped, new = self._progress()
+        symptoms = self._findings(dropped, new)
+        of_both = explained([*symptoms, *self._localisation.findings])
+        disturbs = any(each.kind in ODOMETRY_CAUSES for each in symptoms)
+        if disturbs:
+            self._estimator.distrust_odometry()
+            self._watch.look([], has_slipped=False)
+        else:
+            reasons = [*of_both, *of_all_learnt(self._estimator)]
+            self._watch.look(reasons, has_slipped=new['slip'] > 0)
+        findings = explained([*self._watch.findings, *symptoms])
+        level = max((finding.level for finding in findings), default=Level.NOTE)
+        used = new['velocity'] + new['observation']
+        if dropped and not used and not self._feed.is_paused:
+            level = Level.ERROR
+        problems = worst_first(findings, self._faults())
+        if problems:
+            level = max(level, Level.WARNING)
+        now_s = time.monotonic()
+        self._since_s = {each.kind: self._since_s.get(each.kind, now_s) for each in findings}
+        values = self._input_values() | self._estimator_values(findings)
+        values |= {f'problem {i}': problem for i, problem in enumerate(problems, start=1)}
+        values |= {f'{kind}, for [s]': f'{now_s - t:.0f}' for kind, t in self._since_s.items()}
+        status = DiagnosticStatus(
+            level=bytes([level]),
+            name=f'{self._node.get_fully_qualified_name().lstrip("/")}: estimate',
+            hardware_id=self._hardware_id,
+            message=in_brief(problems) or 'running',
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+        of_fit = [each for each in self._localisation.findings if each in of_both]
+        localisation = self._localisation.status(self._hardware_id, of_fit)
+        message = DiagnosticArray(status=[status, localisation])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def _input_values(self) -> dict[str, str]:
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._last_time_s
+        self._last_time_s = now_s
+        values = {}
+        for source in self._inputs:
+            new = source.received - self._last_received[source.topic]
+            self._last_received[source.topic] = source.received
+            age = 'never' if source.age_s is None else f'{source.age_s:.3f}'
+            values[f'{source.topic} rate [Hz]'] = f'{new / elapsed_s:.1f}'
+            values[f'{source.topic} age [s]'] = age
+            values[f'{source.topic} wait [s]'] = f'{source.backlog.wait_s:.3f}'
+            if source.malformed:
+                values[f'{source.topic} malformed'] = str(source.malformed)
+        if (age_s := self._estimate_publisher.odometry_age_s) is not None:
+            values['odometry on /tf age [s]'] = f'{age_s:.3f}'
+        return values
+
+    def _estimator_values(self, findings: Sequence[Finding]) -> dict[str, str]:
+        values = estimator_values(self._estimator, self._dropped(), findings)
+        age_s = 'never' if self._seen_s is None else f'{time.monotonic() - self._seen_s:.0f}'
+        values['landmarks seen, age [s]'] = age_s
+        values['processing time, mean [ms]'] = f'{self._feed.take_mean_processing_ms():.3f}'
+        return values
+
+    def _progress(self) -> tuple[Counter[str], Counter[str]]:
+        """Return why messages were dropped since the last time, and what else was counted."""
+        dropped = self._dropped()
+        dropped['malformed'] += sum(source.malformed for source in self._inputs)
+        counts = self._estimator.counts
+        since_last = dropped - self._last_dropped, counts - self._last_counts
+        self._last_dropped, self._last_counts = dropped, counts
+        if since_last[1]['observed_point']:
+            self._seen_s = time.monotonic()
+        return since_last
+
+    def _dropped(self) -> Counter[str]:
+        """Return why messages that could be read were not used."""
+        shed = Counter(overload=sum(source.shedding.shed for source in self._inputs))
+        return self._estimator.dropped + self._feed.dropped + shed
+
+    def _findings(self, dropped: Counter[str], new: Counter[str]) -> list[Finding]:
+        """Return what is wrong by what was counted since the last time."""
+        malformed = Counter({source.topic: source.malformed for source in self._inputs})
+        unreadable, unstamped = malformed - self._last_malformed, self._feed.unstamped
+        inputs = [
+            InputNumbers(
+                source.name,
+                source.topic,
+                source.received,
+                source.silent_s,
+                source.problem,
+                source.doubt,
+                source.last_malformed if unreadable[source.topic] else None,
+            )
+            for source in self._inputs
+        ]
+        self._recent_counts.append(new)
+        progress = Progress(
+            dropped,
+            new,
+            unstamped - self._last_unstamped,
+            sum(self._recent_counts, Counter()),
+            is_paused=self._feed.is_paused,
+            has_seen=self._seen_s is not None,
+        )
+        self._last_malformed, self._last_unstamped = malformed, unstamped.copy()
+        findings = of_node(self._estimator, inputs, progress)
+        for finding in findings:
+            if finding.kind == 'empty_messages' and not self._said_empty:
+                self._said_empty = True
+                self._node.get_logger().warning(finding.text())
+        return findings
+
+    def _faults(self) -> list[str]:
+        """Return what inputs, clocks and publishers report of themselves, with what to do."""
+        faults = [source.problem for source in self._inputs]
+        faults += self._feed.clock_problems()
+        faults.append(self._estimate_publisher.early_odometry())
+        faults.append(self._estimate_publisher.rivals())
+        faults.append(self._estimate_publisher.problem)
+        faults.append(self._node.last_failure)
+        return [fault for fault in faults if fault]

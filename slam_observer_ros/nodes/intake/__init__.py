@@ -1,1 +1,0 @@
-"""From ROS messages to events."""
