@@ -7,7 +7,7 @@ from setuptools import Extension, find_packages, setup
 
 PACKAGE = 'slam_observer_ros'
 
-COMPILED = runpy.run_path(f'{PACKAGE}/common/compiled.py')
+COMPILED = runpy.run_path(f'{PACKAGE}/common/process.py')
 
 ROS_RELEASES = ('jazzy', 'kilted')  # those whose wheels are on PyPI
 ROS_WHEELS = (

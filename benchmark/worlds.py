@@ -19,8 +19,7 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.models.held_velocities import HeldVelocities
 from slam_observer_ros.models.motion_noise import MotionNoise
 from slam_observer_ros.models.observation_noise import ObservationNoise
-from slam_observer_ros.recordings.data_sets import load_mrclam, load_starry_night
-from slam_observer_ros.recordings.graph_files import load_graph
+from slam_observer_ros.recordings.data_sets import load_graph, load_mrclam, load_starry_night
 from slam_observer_ros.recordings.trajectory import LandmarkTruth, Trajectory
 from slam_observer_ros.recordings.writer import DataSet
 from slam_observer_ros.settings.estimator_settings import Settings

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from slam_observer_ros.cli.console import table_of
-from slam_observer_ros.common.digits import significant
+from slam_observer_ros.common.errors import significant
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.recordings.trajectory import Trajectory
 from slam_observer_ros.runs.figures import plot_configuration, plot_lyapunov

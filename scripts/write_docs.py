@@ -27,10 +27,13 @@ from rclpy.qos import DurabilityPolicy
 from slam_observer_ros.nodes.observer_nodes import ObserverNode
 from slam_observer_ros.nodes.simulator import SimulatorNode
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import AUTO, InputSettings, message_types, Role
 from slam_observer_ros.settings.node_settings import (
+    AUTO,
+    InputSettings,
     ManagedNodeSettings,
+    message_types,
     ObserverNodeSettings,
+    Role,
     SimulatorNodeSettings,
 )
 from slam_observer_ros.settings.parameter_table import Parameter, table

@@ -31,8 +31,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.recordings.recorded_truth import Truth
-from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory
+from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory, Truth
 from slam_observer_ros.runs.consistency import anchored_average_nees
 from slam_observer_ros.runs.metrics import ConfigurationError
 

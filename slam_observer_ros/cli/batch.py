@@ -45,7 +45,7 @@ from slam_observer_ros.common.errors import IncompleteError, OutputError, UsageE
 from slam_observer_ros.common.files import destination
 from slam_observer_ros.recordings.opening import sha256_of
 from slam_observer_ros.recordings.trajectory import write_tum
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 logger = logging.getLogger(__name__)
 

@@ -19,8 +19,7 @@ from urllib.parse import quote
 import numpy as np
 
 from slam_observer_ros.cli.batch_jobs import FILES, Line
-from slam_observer_ros.common.digits import significant
-from slam_observer_ros.common.errors import OutputError
+from slam_observer_ros.common.errors import OutputError, significant
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.report.page import asset

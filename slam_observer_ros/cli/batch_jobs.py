@@ -27,13 +27,12 @@ from typing import Any
 from slam_observer_ros.cli.options import parse_value
 from slam_observer_ros.cli.replay_request import ReplayRequest
 from slam_observer_ros.common import __version__
-from slam_observer_ros.common.digits import json_text
-from slam_observer_ros.common.errors import OutputError, shown, UsageError
+from slam_observer_ros.common.errors import json_text, OutputError, shown, UsageError
 from slam_observer_ros.common.files import not_special, unfinished_file
 from slam_observer_ros.mapping.map_file import map_files
 from slam_observer_ros.runs.accuracy import FIGURES
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names, suggestion, table, Value
 
 logger = logging.getLogger(__name__)

@@ -55,7 +55,7 @@ from slam_observer_ros.recordings.opening import files_of
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.runs.health import of_mounting, of_noise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_file import write_found
 
 

@@ -16,7 +16,7 @@ from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor
 from slam_observer_ros.lie import so3
 from slam_observer_ros.models.calibration import Entry, OF_SENSOR, OF_VELOCITY
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import Pose6
 
 MUCH = 0.9

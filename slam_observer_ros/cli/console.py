@@ -13,7 +13,7 @@ import sys
 import threading
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from slam_observer_ros.common.digits import json_text
+from slam_observer_ros.common.errors import json_text
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.process import leaving_at_once
 

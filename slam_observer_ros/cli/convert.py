@@ -22,12 +22,12 @@ from slam_observer_ros.common.findings import found
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_file import write_map
 from slam_observer_ros.recordings.data_sets import (
+    load_graph,
     load_mrclam,
     load_plaza,
     load_starry_night,
     MEASURES,
 )
-from slam_observer_ros.recordings.graph_files import load_graph
 from slam_observer_ros.recordings.opening import files_of
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import pose_topic

@@ -42,7 +42,7 @@ from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.runs.health import of_half_points
 from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import message_types
+from slam_observer_ros.settings.node_settings import message_types
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 

@@ -18,7 +18,7 @@ from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.recordings.opening import sha256_of
 from slam_observer_ros.recordings.reader import Recording
-from slam_observer_ros.recordings.recorded_truth import Truth
+from slam_observer_ros.recordings.trajectory import Truth
 from slam_observer_ros.runs.accuracy import Likelihood, LikelihoodRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings

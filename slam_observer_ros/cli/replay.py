@@ -30,7 +30,7 @@ from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, figure_text
 from slam_observer_ros.runs.input_health import list_dropped
 from slam_observer_ros.runs.metrics import TrajectoryErrors
 from slam_observer_ros.runs.reported_run import Replay, Sighting
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names
 
 

@@ -14,10 +14,9 @@ from slam_observer_ros.common.findings import Finding, found, Level
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.recordings.reader import Recording
-from slam_observer_ros.recordings.recorded_truth import Truth
 from slam_observer_ros.recordings.sources import Loss, NOTHING_LOST
 from slam_observer_ros.recordings.topics import SelectedTopics
-from slam_observer_ros.recordings.trajectory import Trajectory
+from slam_observer_ros.recordings.trajectory import Trajectory, Truth
 from slam_observer_ros.runs.accuracy import (
     Accuracy,
     measure,
@@ -40,7 +39,7 @@ from slam_observer_ros.runs.health import (
 from slam_observer_ros.runs.input_health import MALFORMED, of_recording, of_timing, unused_messages
 from slam_observer_ros.runs.metrics import TrajectoryErrors
 from slam_observer_ros.runs.reported_run import NisTally, Replay, ReportedRun, RunRecorder
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 logger = logging.getLogger(__name__)
 

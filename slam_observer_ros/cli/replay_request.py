@@ -16,11 +16,14 @@ from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.recordings.reader import Recording
-from slam_observer_ros.recordings.recorded_truth import Truth
 from slam_observer_ros.recordings.topics import SelectedTopics, TopicNames
+from slam_observer_ros.recordings.trajectory import Truth
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings, short_names
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.node_settings import (
+    InputSettings,
+    ObserverNodeSettings,
+    short_names,
+)
 from slam_observer_ros.settings.parameter_table import from_parameters, table, Value
 
 logger = logging.getLogger(__name__)

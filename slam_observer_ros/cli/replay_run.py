@@ -24,8 +24,7 @@ from slam_observer_ros.runs.input_health import of_use
 from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.runs.reported_run import NisTally, Replay, RunRecorder
-from slam_observer_ros.settings.input_settings import InputSettings
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.node_settings import InputSettings, ObserverNodeSettings
 
 if TYPE_CHECKING:
     from slam_observer_ros.recordings.writer import RecordingWriter

@@ -1,13 +1,20 @@
-"""In how many threads a process computes, and how it ends; imports nothing slow to load."""
+"""How a process computes, in how many threads and by what is compiled, and how it ends.
+
+It imports nothing slow to load. Each compiled module has a reference in numpy.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 import os
+from pathlib import Path
 import signal
 import time
-from types import FrameType
+from types import FrameType, ModuleType
+import warnings
+import zlib
 
 CHOICES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'BLIS_NUM_THREADS')
 """Environment variables by which a user says how many there shall be."""
@@ -117,3 +124,37 @@ class StopSignal:
         if not self._has_begun:
             os._exit(0)
         self.is_set = True
+
+
+VARIABLE = 'SLAM_OBSERVER_CORE'
+"""Environment variable that chooses the references where it is ``numpy``."""
+
+PACKAGE = Path(__file__).parents[1]
+
+
+def compiled(name: str) -> ModuleType | None:
+    """Return a compiled module; None where it was not built, or is not to be used."""
+    if os.environ.get(VARIABLE) == 'numpy':
+        return None
+    try:
+        module = import_module(f'slam_observer_ros.{name}')
+    except ImportError:  # there was no compiler
+        return None
+    if digest_of_sources(name) in (None, getattr(module, 'SOURCES', 0)):
+        return module
+    warnings.warn(
+        f'{module.__file__} was built from other sources than there are now, and numpy takes its '
+        'place: build it by `make`, or `python setup.py build_ext --inplace`',
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return None
+
+
+def digest_of_sources(name: str) -> int | None:
+    """Return a number that changes with the sources of a module; None where they are not."""
+    source = (PACKAGE / name.replace('.', '/')).with_suffix('.c')
+    if not source.exists():
+        return None
+    headers = sorted((PACKAGE / 'filter').glob('_*.h'))
+    return zlib.crc32(b''.join(path.read_bytes() for path in (source, *headers)))

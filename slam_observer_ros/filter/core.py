@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from slam_observer_ros.common.compiled import compiled, VARIABLE
+from slam_observer_ros.common.process import compiled, VARIABLE
 from slam_observer_ros.filter import step
 
 COMPILED = compiled('filter._core')

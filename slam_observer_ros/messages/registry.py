@@ -19,7 +19,7 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.events import VelocityBlock, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer, CdrBlockReader, CdrReader
-from slam_observer_ros.settings.input_settings import message_types, MessageType, register, Role
+from slam_observer_ros.settings.node_settings import message_types, MessageType, register, Role
 
 MessageT = TypeVar('MessageT')
 MessageT_co = TypeVar('MessageT_co', covariant=True)

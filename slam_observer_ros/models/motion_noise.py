@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_observer_ros.common.digits import significant
+from slam_observer_ros.common.errors import significant
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.lie.matrices import (

@@ -33,16 +33,16 @@ from slam_observer_ros.messages.registry import Decode, decoders
 from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.input_topic import InputTopic
 from slam_observer_ros.nodes.ros_node import is_installed, message_class
-from slam_observer_ros.recordings.odometry import OdometryCheck
+from slam_observer_ros.recordings.event_builder import OdometryCheck
 from slam_observer_ros.runs.live_health import of_twist
-from slam_observer_ros.settings.input_settings import (
+from slam_observer_ros.settings.node_settings import (
     AUTO,
     message_types,
+    ObserverNodeSettings,
     ON_TF,
     POSE_DIFFERENCES,
     Role,
 )
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 QUEUE_DEPTH = 100
 """Messages of an input that are kept while the node is busy."""

@@ -31,8 +31,7 @@ from slam_observer_ros.recordings.event_builder import (
 )
 from slam_observer_ros.recordings.frames import BaseFrame
 from slam_observer_ros.runs.live_health import ClockOffset
-from slam_observer_ros.settings.input_settings import ON_TF
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings, ON_TF
 
 SOURCES: dict[type[Event], str] = {
     VelocityEvent: 'twist',

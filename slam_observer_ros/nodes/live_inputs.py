@@ -22,7 +22,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.detections import observed_tags
 from slam_observer_ros.messages.poses import decode_transforms, TRANSFORMS
 from slam_observer_ros.nodes.ros_node import message_class
-from slam_observer_ros.settings.input_settings import (
+from slam_observer_ros.settings.node_settings import (
     InputSettings,
     message_types,
     MessageType,

@@ -23,10 +23,10 @@ from slam_observer_ros.recordings.decoding import (
     decode_transform_message,
     input_decoders,
 )
-from slam_observer_ros.recordings.odometry import OdometryCheck
+from slam_observer_ros.recordings.event_builder import OdometryCheck
 from slam_observer_ros.recordings.sources import MessageSource, RawMessage, Topic
 from slam_observer_ros.recordings.topics import SelectedTopics
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 MAX_EMPTY_CLOUDS = 1000
 """Most clouds of a topic that are looked at for one with points, which shows the ids."""

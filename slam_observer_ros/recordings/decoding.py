@@ -34,11 +34,11 @@ from slam_observer_ros.messages.poses import (
 )
 from slam_observer_ros.messages.registry import BlockDecoder, Decoder, decoders
 from slam_observer_ros.messages.registry import Decode as DecodeOne
-from slam_observer_ros.recordings.bag_source import types_in
 from slam_observer_ros.recordings.event_builder import Measured
+from slam_observer_ros.recordings.opening import types_in
 from slam_observer_ros.recordings.sources import RawBlock, RawMessage, Topic
 from slam_observer_ros.recordings.topics import SelectedTopics
-from slam_observer_ros.settings.input_settings import (
+from slam_observer_ros.settings.node_settings import (
     InputSettings,
     message_types,
     POSE_DIFFERENCES,

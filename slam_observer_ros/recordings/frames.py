@@ -30,7 +30,7 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import is_measured
 from slam_observer_ros.messages.detections import Camera
 from slam_observer_ros.messages.poses import pose_stack, PoseMessage
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import check_angles, Pose6
 
 logger = logging.getLogger(__name__)

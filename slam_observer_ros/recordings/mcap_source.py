@@ -1,32 +1,34 @@
-"""Messages of an MCAP file in the order in which they were received, one topic's in blocks.
+"""Messages of an MCAP file, whole or damaged, in order of reception, one topic's in blocks.
 
-The library's readers give them one by one, and none of a damaged file's end.
+The library's readers give them one by one, and none of a damaged file's end. The file is read from
+its beginning to its end. Its message indexes make that faster, and its statistics say what is
+missing, but which messages it has is seen in these alone.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 import heapq
+from io import BytesIO
 from itertools import pairwise
 import mmap
 from pathlib import Path
-from typing import Final, NamedTuple
+import re
+import struct
+from typing import Final, NamedTuple, TypeAlias
 
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Schema, Statistics
+from mcap.stream_reader import get_chunk_data_stream
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.recordings.mcap_records import (
-    content_of,
-    LEAST_LENGTH,
-    MAX_NS,
-    McapRecords,
-    MESSAGE,
-    Piece,
-)
 from slam_observer_ros.recordings.sources import (
     by_key,
     damage_reported,
@@ -36,8 +38,277 @@ from slam_observer_ros.recordings.sources import (
     MOST_IN_BLOCK,
     RawBlock,
     RawMessage,
+    ros2_type,
     Topic,
 )
+
+_MAGIC: Final = b'\x89MCAP0\r\n'
+_HEADER: Final = struct.Struct('<BQ')
+"""How a record begins: opcode and length."""
+
+_PRIVATE: Final = 0x80
+"""The least opcode of records that programs may add, which others pass over."""
+
+_INDEX_HEADER: Final = 2 + 4
+"""Bytes of a message index before its entries: channel, and their length."""
+
+MESSAGE: Final = np.dtype(
+    [
+        ('opcode', 'u1'),
+        ('length', '<u8'),
+        ('channel', '<u2'),
+        ('sequence', '<u4'),
+        ('stamp_ns', '<u8'),
+        ('publish_ns', '<u8'),
+    ]
+)
+"""What comes before the data of a message."""
+
+LEAST_LENGTH: Final = MESSAGE.itemsize - _HEADER.size
+"""Length of a message without data."""
+
+MAX_NS: Final = 2**63 - 1
+
+_BARE_SIZE: Final = 1 << 20
+"""Bytes of messages outside chunks that are read at once, about as many as a chunk has."""
+
+_NEXT: Final = re.compile(
+    rb'\x06.{6}\x00\x00.{28}(?:\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)'
+    rb'|\x05.{4}\x00\x00\x00\x00',
+    re.DOTALL,
+)
+"""How a chunk begins: opcode, length, times, size and sum, compression; or how a message does."""
+
+_Take: TypeAlias = Callable[[int, bytes], None]
+"""Is given the opcode and the content of a record that is no message."""
+
+
+class Piece(NamedTuple):
+    """A chunk, or messages that follow each other outside of chunks: where, and what is in it."""
+
+    begin: int
+    end: int
+    is_chunk: bool
+    start_ns: int = 0
+    channels: frozenset[int] = frozenset()
+
+
+class McapRecords:
+    """What a walk through a file finds; of a damaged one, what is before and behind the damage.
+
+    ``pieces`` are in the order of the file, ``channels`` are by their numbers.
+    """
+
+    def __init__(self) -> None:
+        self.pieces: list[Piece] = []
+        self._schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._counts: Counter[int] = Counter()
+        self._stated_count = self._lost_bytes = self._gap_ns = 0
+        self._is_cut_off = True
+        self.start_ns = self.end_ns = 0
+        self._is_behind_damage = False
+
+    def part(self, channel: Channel) -> Topic:
+        """Return the topic of a channel, with the messages of this one."""
+        count, schema = self._counts[channel.id], self._schemas.get(channel.schema_id)
+        if schema is None:
+            return Topic(channel.topic, '', count)
+        definition = schema.data.decode(errors='replace')
+        return Topic(channel.topic, ros2_type(schema.name), count, definition)
+
+    @property
+    def loss(self) -> Loss:
+        """What is damaged or missing, also of what the statistics in the file count."""
+        nameless = sum(self._counts[number] for number in self._counts.keys() - self.channels)
+        missing = max(self._stated_count - self._counts.total(), 0) + nameless
+        return Loss(self._lost_bytes, to_s(self._gap_ns), self._is_cut_off, missing)
+
+    def walk(self, data: mmap.mmap) -> None:
+        """Find out what is in the file."""
+        size, place = len(data), len(_MAGIC)
+        if data[:place] != _MAGIC:
+            self._lose(min(size, place))
+        while place + _HEADER.size <= size:
+            opcode, length = _HEADER.unpack_from(data, place)
+            end = place + _HEADER.size + length
+            is_known = 1 <= opcode <= max(Opcode) or opcode >= _PRIVATE
+            if not is_known or end > size:
+                after = _next_whole(data, place + 1, self.channels)
+                self._lose(after - place)
+                place = after
+                continue
+            if opcode == Opcode.MESSAGE:
+                end = _end_of_messages(data, end)
+            try:
+                self._take_record(data, opcode, place, end)
+            except Exception:  # noqa: BLE001 (decompressors and struct raise whatever they like)
+                self._lose(end - place)
+            if opcode == Opcode.FOOTER:
+                self._is_cut_off = False
+                return
+            place = end
+        self._lose(size - place)
+
+    def _lose(self, byte_count: int) -> None:
+        self._lost_bytes += byte_count
+        self._is_behind_damage = True
+
+    def _take_record(self, data: mmap.mmap, opcode: int, place: int, end: int) -> None:
+        if opcode == Opcode.CHUNK:
+            self._take_piece(data, Piece(place + _HEADER.size, end, is_chunk=True))
+        elif opcode == Opcode.MESSAGE:
+            self._take_piece(data, Piece(place, end, is_chunk=False))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
+            self._take_description(opcode, data[place + _HEADER.size : end])
+
+    def _take_description(self, opcode: int, content: bytes) -> None:
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            self.channels[channel.id] = channel
+        elif opcode == Opcode.STATISTICS:
+            self._stated_count = Statistics.read(stream).message_count
+
+    def _take_piece(self, data: mmap.mmap, piece: Piece) -> None:
+        _, _, heads = content_of(data, piece, self._take_description)
+        if not len(heads):
+            return
+        first_ns, last_ns = int(heads['stamp_ns'].min()), int(heads['stamp_ns'].max())
+        if last_ns >= MAX_NS:
+            raise ValueError('no clock has this time')
+        if not self.pieces:
+            self.start_ns, self.end_ns = first_ns, first_ns
+        if self._is_behind_damage:
+            self._gap_ns += max(first_ns - self.end_ns, 0)
+            self._is_behind_damage = False
+        self.start_ns, self.end_ns = min(self.start_ns, first_ns), max(self.end_ns, last_ns)
+        counts = np.bincount(heads['channel'])
+        channels = np.flatnonzero(counts).tolist()
+        self._counts.update(dict(zip(channels, counts[channels].tolist(), strict=True)))
+        self.pieces.append(piece._replace(start_ns=first_ns, channels=frozenset(channels)))
+
+
+def _next_whole(data: mmap.mmap, place: int, channels: Collection[int]) -> int:
+    """Return where the next chunk or message begins that is whole; the end if there is none.
+
+    A message, which has no pattern, counts if it is of a known channel, and one follows it.
+    """
+    while (match := _NEXT.search(data, place)) is not None:
+        place = match.start()
+        opcode, length = _HEADER.unpack_from(data, place)
+        end = place + _HEADER.size + length
+        if opcode == Opcode.CHUNK:
+            is_whole = end == len(data) or (end < len(data) and 1 <= data[end] <= max(Opcode))
+        else:
+            is_whole = all(_is_message(data, begin, channels) for begin in (place, end))
+        if is_whole:
+            return place
+        place += 1
+    return len(data)
+
+
+def _is_message(data: mmap.mmap, place: int, channels: Collection[int]) -> bool:
+    if place + MESSAGE.itemsize > len(data):
+        return False
+    opcode, length = _HEADER.unpack_from(data, place)
+    channel = int.from_bytes(data[place + _HEADER.size : place + _HEADER.size + 2], 'little')
+    fits = LEAST_LENGTH <= length <= len(data) - place - _HEADER.size
+    return opcode == Opcode.MESSAGE and channel in channels and fits
+
+
+def _end_of_messages(data: mmap.mmap, place: int) -> int:
+    """Return where messages end that begin at ``place``, or enough of them."""
+    most = place + _BARE_SIZE
+    while place < most and place + _HEADER.size <= len(data):
+        opcode, length = _HEADER.unpack_from(data, place)
+        end: int = place + _HEADER.size + length
+        if opcode != Opcode.MESSAGE or end > len(data):
+            break
+        place = end
+    return place
+
+
+def content_of(
+    data: mmap.mmap, piece: Piece, take: _Take
+) -> tuple[NDArray[np.uint8], IntArray, NDArray[np.void]]:
+    """Return the records of a piece, where its messages begin (n,), and what heads their data.
+
+    Raises a ValueError, or whatever decompressors do, if it is damaged.
+    """
+    content, indexed = data[piece.begin : piece.end], np.empty(0, dtype=np.int64)
+    if piece.is_chunk:
+        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        content, indexed = stream.read(size), _indexed(data, piece.end)
+    try:
+        begins = _begins(content, indexed, take)
+    except (ValueError, struct.error):  # the index is wrong, or all is
+        begins = _begins(content, indexed[:0], take)
+    heads = _heads(content, begins)
+    if (heads['length'] < LEAST_LENGTH).any():
+        raise ValueError('a message is too short')
+    return np.frombuffer(content, dtype=np.uint8), begins, heads
+
+
+def _indexed(data: mmap.mmap, place: int) -> IntArray:
+    """Return where message indexes behind a chunk say that messages begin in it, in order."""
+    found = [np.empty(0, dtype=np.uint64)]
+    while place + _HEADER.size <= len(data):
+        opcode, length = _HEADER.unpack_from(data, place)
+        begin, place = place + _HEADER.size + _INDEX_HEADER, place + _HEADER.size + length
+        if opcode != Opcode.MESSAGE_INDEX:
+            break
+        entries = data[begin:place]
+        found.append(np.frombuffer(entries[: len(entries) // 16 * 16], '<u8')[1::2])
+    # Each index is in order, and so stable sorting merges them in one pass.
+    begins = np.sort(np.concatenate(found).astype(np.int64), kind='stable')
+    distinct: IntArray = begins[np.diff(begins, prepend=-1) != 0]
+    return distinct
+
+
+def _begins(content: bytes, indexed: IntArray, take: _Take) -> IntArray:
+    """Return where messages begin in records: indexed ones, and all in between."""
+    heads = _heads(content, indexed)
+    if (heads['opcode'] != Opcode.MESSAGE).any():
+        raise ValueError('the index is wrong')
+    ends = indexed + _HEADER.size + heads['length'].astype(np.int64)
+    starts, stops = np.append(0, ends), np.append(indexed, len(content))
+    others = starts != stops
+    between = zip(starts[others].tolist(), stops[others].tolist(), strict=True)
+    walked = [_walked(content, begin, end, take) for begin, end in between]
+    return np.sort(np.concatenate([indexed, *walked]), kind='stable')
+
+
+def _walked(content: bytes, place: int, end: int, take: _Take) -> IntArray:
+    """Return where messages begin in a part of records, one after the other."""
+    begins = []
+    while place < end:
+        opcode, length = _HEADER.unpack_from(content, place)
+        after = place + _HEADER.size + length
+        if opcode == Opcode.MESSAGE:
+            begins.append(place)
+        else:
+            take(opcode, content[place + _HEADER.size : after])
+        place = after
+    if place != end:
+        raise ValueError('a record goes beyond the end')
+    return np.array(begins, dtype=np.int64)
+
+
+def _heads(content: bytes, begins: IntArray) -> NDArray[np.void]:
+    """Return what comes before the data of messages that begin there."""
+    if not len(begins):
+        return np.empty(0, dtype=MESSAGE)
+    if not 0 <= begins[0] <= begins[-1] <= len(content) - MESSAGE.itemsize:
+        raise ValueError('a message goes beyond the end')
+    bytes_of = sliding_window_view(np.frombuffer(content, dtype=np.uint8), MESSAGE.itemsize)
+    heads: NDArray[np.void] = bytes_of[begins].view(MESSAGE)[:, 0]
+    return heads
+
 
 _PLACE: Final = np.dtype([(name, np.int64) for name in ('stamp_ns', 'topic', 'begin', 'size')])
 """When a message was received, the number of its topic, and where its data is."""

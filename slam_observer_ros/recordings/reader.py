@@ -40,7 +40,6 @@ from slam_observer_ros.recordings.event_builder import (
 )
 from slam_observer_ros.recordings.frames import BaseFrame, insert_transforms, TransformBuffer
 from slam_observer_ros.recordings.opening import open_source
-from slam_observer_ros.recordings.recorded_truth import base_in_frames, other_frames, Truth
 from slam_observer_ros.recordings.sources import (
     FEWEST_IN_BLOCK,
     Loss,
@@ -55,9 +54,9 @@ from slam_observer_ros.recordings.topics import (
     transform_topics,
     TransformTopics,
 )
-from slam_observer_ros.recordings.trajectory import Trajectory
+from slam_observer_ros.recordings.trajectory import base_in_frames, other_frames, Trajectory, Truth
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 if TYPE_CHECKING:
     from slam_observer_ros.recordings.writer import RecordingWriter

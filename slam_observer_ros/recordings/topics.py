@@ -13,7 +13,7 @@ from slam_observer_ros.messages.clouds import CLOUDS
 from slam_observer_ros.messages.detections import CAMERA_INFO, IN_IMAGES
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recordings.sources import last_part, Topic
-from slam_observer_ros.settings.input_settings import (
+from slam_observer_ros.settings.node_settings import (
     AUTO,
     InputSettings,
     message_types,

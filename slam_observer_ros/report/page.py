@@ -11,8 +11,7 @@ import sys
 import numpy as np
 
 from slam_observer_ros.common import __version__
-from slam_observer_ros.common.digits import json_text
-from slam_observer_ros.common.errors import OutputError
+from slam_observer_ros.common.errors import json_text, OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.types import BoolArray, FloatArray

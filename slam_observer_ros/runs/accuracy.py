@@ -15,8 +15,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.common.digits import significant
-from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.errors import EvaluationError, significant
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
@@ -29,8 +28,7 @@ from slam_observer_ros.models.calibration import (
     OF_VELOCITY,
     stated_of_velocity,
 )
-from slam_observer_ros.recordings.recorded_truth import Truth
-from slam_observer_ros.recordings.trajectory import filled, Trajectory
+from slam_observer_ros.recordings.trajectory import filled, Trajectory, Truth
 from slam_observer_ros.runs.consistency import anchored_average_nees
 from slam_observer_ros.runs.metrics import (
     ConfigurationError,

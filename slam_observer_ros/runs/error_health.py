@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam_observer_ros.common.digits import significant
+from slam_observer_ros.common.errors import significant
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray

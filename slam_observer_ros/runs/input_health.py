@@ -14,8 +14,11 @@ from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import SelectedTopics
 from slam_observer_ros.runs.health import of_stamps
 from slam_observer_ros.runs.reported_run import Replay
-from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.node_settings import (
+    InputSettings,
+    ObserverNodeSettings,
+    POSE_DIFFERENCES,
+)
 
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""

@@ -20,8 +20,7 @@ from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEve
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.models.sensing import RangeErrors
 from slam_observer_ros.models.velocity_history import VelocityHistory
-from slam_observer_ros.recordings.recorded_truth import LandmarkTracks, Truth
-from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
+from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTracks, Trajectory, Truth
 from slam_observer_ros.runs.metrics import ConfigurationError
 from slam_observer_ros.runs.reported_run import Replay, RunRecorder
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler

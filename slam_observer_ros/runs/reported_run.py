@@ -25,8 +25,7 @@ from slam_observer_ros.estimates import (
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.lie import se3
-from slam_observer_ros.recordings.recorded_truth import Truth
-from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory
+from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory, Truth
 from slam_observer_ros.runs.metrics import ConfigurationError, pose_errors, TrajectoryErrors
 from slam_observer_ros.settings.estimator_settings import Settings
 

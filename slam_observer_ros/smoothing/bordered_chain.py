@@ -25,7 +25,7 @@ from scipy.linalg.blas import dtbsv
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csc_array
 
-from slam_observer_ros.common.compiled import compiled
+from slam_observer_ros.common.process import compiled
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.lie.matrices import inverse_by_factor, transpose
 

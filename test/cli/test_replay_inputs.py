@@ -14,7 +14,7 @@ from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import TopicNames
 from slam_observer_ros.recordings.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 MS = 1_000_000
 STEP_NS = 50 * MS

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from slam_observer_ros.common import compiled
+from slam_observer_ros.common import process as compiled
 
 NAMES = ('filter._core', 'smoothing._gauss_newton')
 

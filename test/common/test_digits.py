@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from slam_observer_ros.common.digits import json_text, significant
+from slam_observer_ros.common.errors import json_text, significant
 
 
 @pytest.mark.parametrize(

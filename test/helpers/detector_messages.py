@@ -8,7 +8,7 @@ import numpy as np
 import ros_messages as ros
 from rosbags.typesys import get_types_from_msg
 
-from slam_observer_ros.settings.input_settings import message_types
+from slam_observer_ros.settings.node_settings import message_types
 
 NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 for known in message_types('landmarks').values():

@@ -14,7 +14,7 @@ import sys
 import sysconfig
 import tempfile
 
-from slam_observer_ros.common.compiled import digest_of_sources, PACKAGE
+from slam_observer_ros.common.process import digest_of_sources, PACKAGE
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 MODULES = ('filter._core', 'smoothing._gauss_newton')

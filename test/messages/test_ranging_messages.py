@@ -106,6 +106,6 @@ def test_a_range_beyond_what_the_sensor_measures_is_none(beyond):
 
 
 def test_a_range_is_only_taken_where_somebody_names_it():
-    from slam_observer_ros.settings.input_settings import message_types
+    from slam_observer_ros.settings.node_settings import message_types
 
     assert message_types('landmarks')['sensor_msgs/msg/Range'].is_ambiguous

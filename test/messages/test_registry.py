@@ -20,9 +20,8 @@ from slam_observer_ros.messages.poses import decode_twist_stamped
 from slam_observer_ros.messages.registry import decoders, reads
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.settings import input_settings
-from slam_observer_ros.settings.input_settings import InputSettings
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings import node_settings as input_settings
+from slam_observer_ros.settings.node_settings import InputSettings, ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import table
 
 CONTRIBUTING = Path(__file__).resolve().parents[2] / 'CONTRIBUTING.md'

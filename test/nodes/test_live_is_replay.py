@@ -31,7 +31,7 @@ from slam_observer_ros.recordings.topics import TopicNames
 from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names
 from slam_observer_ros.simulation import Scenario
 

@@ -15,8 +15,7 @@ import pytest
 
 from slam_observer_ros.common.errors import DataSetError, RecordingError
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.recordings.data_sets import load_mrclam, load_starry_night
-from slam_observer_ros.recordings.graph_files import load_graph
+from slam_observer_ros.recordings.data_sets import load_graph, load_mrclam, load_starry_night
 from slam_observer_ros.recordings.opening import MAX_METADATA_BYTES
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.writer import DataSet, RecordingWriter

@@ -12,11 +12,11 @@ from slam_observer_ros.events import BEARING, ObservationEvent, RANGE, VelocityE
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.recordings.data_sets import (
     EPOCH_NS,
+    load_graph,
     load_mrclam,
     load_plaza,
     load_starry_night,
 )
-from slam_observer_ros.recordings.graph_files import load_graph
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.writer import DataSet, write_data_set
 

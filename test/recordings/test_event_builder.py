@@ -18,7 +18,7 @@ from slam_observer_ros.messages.detections import decode_camera_info
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.recordings.event_builder import drop_reason, EventBuilder, MAX_WAITING
 from slam_observer_ros.recordings.frames import BaseFrame, TransformBuffer
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 MS = 1_000_000
 V = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])

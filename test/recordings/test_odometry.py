@@ -8,7 +8,7 @@ import pytest
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.messages.poses import PoseMessage
-from slam_observer_ros.recordings.odometry import OdometryCheck
+from slam_observer_ros.recordings.event_builder import OdometryCheck
 
 PERIOD_NS = 20_000_000
 

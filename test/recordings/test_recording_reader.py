@@ -20,12 +20,11 @@ from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.poses import PoseBlock, PoseMessage
 from slam_observer_ros.recordings.mcap_source import McapSource
 from slam_observer_ros.recordings.reader import Recording
-from slam_observer_ros.recordings.recorded_truth import LandmarkTracks, other_frames
 from slam_observer_ros.recordings.sources import SplitSource
 from slam_observer_ros.recordings.topics import TopicNames
-from slam_observer_ros.recordings.trajectory import LandmarkTruth
+from slam_observer_ros.recordings.trajectory import LandmarkTracks, LandmarkTruth, other_frames
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 FORMATS = [
     'mcap file',

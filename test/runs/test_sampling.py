@@ -13,7 +13,7 @@ import pytest
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
-from slam_observer_ros.recordings.recorded_truth import Truth
+from slam_observer_ros.recordings.trajectory import Truth
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.runs.sampling import SAMPLE_PERIOD_NS
 from slam_observer_ros.settings.estimator_settings import Settings
