@@ -21,7 +21,8 @@ from slam_observer_ros.tracking.slip import slip
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
 SPATIAL = Settings(reorder_window=0.0)
 modes = pytest.mark.parametrize('settings', [PLANAR, SPATIAL], ids=['planar', 'spatial'])
-seeds = pytest.mark.parametrize('seed', range(4))
+seeds = pytest.mark.parametrize('seed', range(3))
+worlds = pytest.mark.parametrize(('settings', 'seed'), [(PLANAR, 0), (PLANAR, 1), (SPATIAL, 2), (SPATIAL, 3)])
 
 
 def seconds(event):
@@ -117,8 +118,7 @@ def carried(settings, seed, landmarks=12):
     return world.with_observations(seen_from_there), moved
 
 
-@modes
-@seeds
+@worlds
 def test_a_robot_that_is_carried_is_found_again_at_once(settings, seed):
     world, moved = carried(settings, seed)
     estimator, _ = run(world, settings)
@@ -236,16 +236,14 @@ def test_landmarks_with_ids_are_another_sensors_to_see(seed):
     assert estimator.counts['unexpected_place'] == 0
 
 
-@modes
-@seeds
+@worlds
 def test_a_robot_that_is_where_it_should_be_is_not_warned_of(settings, seed):
-    world = gain_worlds.drive(settings, 60.0, seed, noise=0.5, landmarks=30)
+    world = gain_worlds.drive(settings, 40.0, seed, noise=0.5, landmarks=30)
     estimator, _ = run(world.with_observations(without_ids), settings)
     assert estimator.counts['unexpected_place'] == 0
 
 
-@modes
-@seeds
+@worlds
 def test_so_is_one_that_is_carried_far_without_being_turned(settings, seed):
     """As far as it sees enough landmarks at once to show where it is."""
     world = gain_worlds.drive(settings, 40.0, seed, noise=0.5, seen=8)
@@ -260,8 +258,7 @@ def test_so_is_one_that_is_carried_far_without_being_turned(settings, seed):
     assert list(errors_m.values())[-1] == pytest.approx(np.hypot(9.0, 4.0), abs=0.3)
 
 
-@modes
-@seeds
+@worlds
 @pytest.mark.parametrize('shift_m', [1.0, 4.0])
 def test_one_observation_that_is_garbled_as_a_whole_does_not_move_the_robot(
     settings, seed, shift_m
@@ -319,8 +316,7 @@ def test_a_landmark_that_moved_and_is_seen_alone_seldom_throws_the_pose(settings
     assert sum(is_thrown_by_a_moved_landmark(settings, seed) for seed in range(6)) <= 1
 
 
-@modes
-@seeds
+@worlds
 def test_a_landmark_that_moved_away_from_beside_the_robot_does_not_throw_the_pose(settings, seed):
     """Its noise belongs to where it is seen now, not to where it was: right at the sensor."""
     rng, estimator, points = np.random.default_rng(seed), Estimator(settings), 4.0 * np.eye(3)
@@ -337,8 +333,7 @@ def test_a_landmark_that_moved_away_from_beside_the_robot_does_not_throw_the_pos
     assert np.linalg.norm(estimator.pose[:3, 3]) < 0.1
 
 
-@modes
-@seeds
+@worlds
 @pytest.mark.parametrize('alone_s', [0.75, 2.0])
 @pytest.mark.parametrize('are_swapped', [False, True])
 def test_two_landmarks_that_moved_alone_in_view_throw_the_pose_for_no_longer(
