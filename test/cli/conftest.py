@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 import shutil
 
 import pytest
 import recordings
 
+from slam_observer_ros.cli import batch
+from slam_observer_ros.cli.batch_pool import Pool
 from slam_observer_ros.cli.main import main
 
 
@@ -22,6 +25,19 @@ def simulated_once(tmp_path_factory):
 def simulated(simulated_once, tmp_path):
     """A simulated run of five seconds, 50 Hz, with truth."""
     return Path(shutil.copy(simulated_once, tmp_path))
+
+
+@pytest.fixture
+def no_processes(monkeypatch):
+    """Let a batch do its runs in the test's process, as others take a second to start."""
+    monkeypatch.setattr(batch, 'local_pool', lambda _: Pool(ThreadPoolExecutor, 1))
+
+
+@pytest.fixture(scope='session')
+def beginning(tmp_path_factory):
+    """Half a minute of the sample, with errors and truth."""
+    path = tmp_path_factory.mktemp('beginning') / 'beginning.mcap'
+    return recordings.write_beginning(path, recordings.SAMPLE, 30.0)
 
 
 @pytest.fixture(scope='session')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 import json
 import math
 import os
@@ -17,7 +18,7 @@ import time
 from browser import open_page
 import numpy as np
 import pytest
-from recordings import events, SAMPLE, write_mcap, write_rosbag1
+from recordings import events, write_mcap, write_rosbag1
 
 from slam_observer_ros.cli.batch_index import write_index
 from slam_observer_ros.cli.batch_jobs import grid_points, opened_log, part_of, read_logs
@@ -39,6 +40,7 @@ RUN = {
 }
 """What a line has at least."""
 GRID = ('--grid', 'point_noise=0.02,0.05', '--grid', 'observation_model=cartesian')
+in_this_process = pytest.mark.usefixtures('no_processes')
 
 
 @pytest.fixture(name='recordings')
@@ -113,6 +115,7 @@ def test_every_recording_is_run_with_every_setting(slam_observer, recordings, tm
     }
 
 
+@in_this_process
 def test_what_is_done_is_not_done_again(slam_observer, recordings, tmp_path):
     out = tmp_path / 'results'
     first = ('batch', recordings[0], '--out', out, '--workers', 1, '--json')
@@ -128,7 +131,10 @@ def test_what_is_done_is_not_done_again(slam_observer, recordings, tmp_path):
     assert slam_observer.succeed(*first).json['done_before'] == 1
 
 
-def test_a_recording_that_fails_is_listed_and_the_rest_done(slam_observer, recordings, tmp_path):
+@in_this_process
+def test_a_recording_that_fails_is_listed_and_the_rest_done(
+    slam_observer, recordings, beginning, tmp_path
+):
     out = tmp_path / 'results'
     bad = tmp_path / 'bad.mcap'
     bad.write_bytes(b'no recording')
@@ -139,12 +145,13 @@ def test_a_recording_that_fails_is_listed_and_the_rest_done(slam_observer, recor
     assert [line['recording'] for line in lines_of(out)] == [str(recordings[0])]
     (failure,) = map(json.loads, (out / 'failed.jsonl').read_text().splitlines())
     assert (failure['recording'], failure['grid']) == (str(bad), {})
-    bad.write_bytes(SAMPLE.read_bytes())  # now it is one
+    bad.write_bytes(beginning.read_bytes())  # now it is one
     slam_observer.succeed('batch', bad, recordings[0], *options)
     assert len(lines_of(out)) == 2
     assert not (out / 'failed.jsonl').exists()
 
 
+@in_this_process
 def test_the_same_recording_under_two_names_is_run_once(slam_observer, recordings, tmp_path):
     copy = tmp_path / 'copy.mcap'
     copy.write_bytes(recordings[0].read_bytes())
@@ -176,6 +183,7 @@ def test_what_can_not_be_run_is_refused_before_anything_is(
     assert not out.exists()
 
 
+@in_this_process
 def test_shards_do_all_runs_once(slam_observer, recordings, tmp_path):
     whole, parts = tmp_path / 'whole', tmp_path / 'parts'
     options = (*recordings, '--grid', 'gains=riccati,constant', '--workers', 1)
@@ -209,9 +217,11 @@ def test_grids_may_have_lists():
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
-def test_a_batch_that_was_stopped_goes_on(slam_observer, tmp_path, number):
+def test_a_batch_that_was_stopped_ends_its_processes_and_goes_on(
+    slam_observer, no_processes, beginning, tmp_path, number
+):
     out = tmp_path / 'results'
-    options = (SAMPLE, '--grid', 'range_noise=0.08,0.09,0.1,0.11', '--workers', 2)
+    options = (beginning, '--grid', 'range_noise=0.07,0.08,0.09,0.1,0.11,0.12', '--workers', 2)
     process = started(*options, '--out', out)
     wait_for_lines(out, 1, process)
     os.kill(process.pid, number)
@@ -220,26 +230,18 @@ def test_a_batch_that_was_stopped_goes_on(slam_observer, tmp_path, number):
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert (out / 'index.html').exists()
-    done = read_logs(out)
-    assert 1 <= len(done) < 4
-    with (out / 'runs.jsonl').open('a') as file:
-        file.write('{"run": "of a line that a power cut has left')
-    slam_observer.succeed('batch', *options, '--out', out)
-    lines = lines_of(out)
-    assert len(lines) == len({line['run'] for line in lines}) == 4
-    assert lines[: len(done)] == list(done.values())
-
-
-def test_processes_end_with_a_batch_that_is_killed(tmp_path):
-    out = tmp_path / 'results'
-    process = started(SAMPLE, '--grid', 'range_noise=0.1,0.2,0.3,0.4,0.5', '--out', out)
-    wait_for_lines(out, 1, process)
-    process.kill()
-    process.wait()
     deadline = time.monotonic() + PATIENCE_S
     while _is_alive(process.pid):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+    done = read_logs(out)
+    assert 1 <= len(done) < 6
+    with (out / 'runs.jsonl').open('a') as file:
+        file.write('{"run": "of a line that a power cut has left')
+    slam_observer.succeed('batch', *options, '--out', out)
+    lines = lines_of(out)
+    assert len(lines) == len({line['run'] for line in lines}) == 6
+    assert lines[: len(done)] == list(done.values())
 
 
 def _is_alive(group: int) -> bool:
@@ -261,33 +263,23 @@ def test_no_two_batches_write_to_one_file(tmp_path):
     assert read_logs(tmp_path)['a'].items() >= RUN.items()
 
 
-def is_ctrl_c_held_back(_: int) -> bool:
-    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
-
-
 def test_ctrl_c_reaches_no_process_that_begins():
-    (ended,) = local_pool(1).run(is_ctrl_c_held_back, [1])
-    assert ended.result
-    assert not is_ctrl_c_held_back(1)
-
-
-def halve_or_die(number: int) -> float:
-    if number == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    if number == 5:
-        raise ZeroDivisionError('five')
-    return number / 2
+    held_back = partial(signal.pthread_sigmask, signal.SIG_BLOCK)
+    (ended,) = local_pool(1).run(held_back, [()])
+    assert signal.SIGINT in ended.result
+    assert signal.SIGINT not in held_back(())
 
 
 def test_a_run_that_kills_its_process_stops_no_other():
-    ended = {one.job: one for one in local_pool(2).run(halve_or_die, range(8))}
-    assert set(ended) == set(range(8))
-    assert 'process died' in ended[3].failure
-    assert ended[5].failure == 'ZeroDivisionError: five'
-    others = [ended[number] for number in range(8) if number not in (3, 5)]
-    assert [one.result for one in others] == [one.job / 2 for one in others]
+    jobs = ['0 / 2', '1 / 2', "__import__('os').abort()", '3 / 2', '4 / 0', '5 / 2']
+    ended = {one.job: one for one in local_pool(2).run(eval, jobs)}
+    assert set(ended) == set(jobs)
+    assert 'process died' in ended[jobs[2]].failure
+    assert ended[jobs[4]].failure == 'ZeroDivisionError: division by zero'
+    assert [ended[job].result for job in jobs if job[4:] == '2'] == [0.0, 0.5, 1.5, 2.5]
 
 
+@in_this_process
 def test_files_that_are_asked_for_later_are_written_later(slam_observer, recordings, tmp_path):
     out = tmp_path / 'results'
     command = ('batch', *recordings, '--out', out, '--workers', 1, '--json')
@@ -344,6 +336,7 @@ def test_a_line_that_is_no_run_is_left_out_and_named(tmp_path, caplog, line):
     assert '1 runs of 1 recordings' in page
 
 
+@in_this_process
 def test_a_batch_goes_on_where_a_line_is_no_run(slam_observer, recordings, tmp_path):
     out = tmp_path / 'results'
     out.mkdir()
@@ -353,6 +346,7 @@ def test_a_batch_goes_on_where_a_line_is_no_run(slam_observer, recordings, tmp_p
     assert [line['recording'] for line in read_logs(out).values()] == [str(recordings[1])]
 
 
+@in_this_process
 def test_a_whole_line_without_an_end_is_kept(slam_observer, recordings, tmp_path):
     out = tmp_path / 'results'
     command = ('batch', recordings[1], '--out', out, '--workers', 1, '--json')
@@ -363,6 +357,7 @@ def test_a_whole_line_without_an_end_is_kept(slam_observer, recordings, tmp_path
     assert (out / 'runs.jsonl').read_bytes() == content
 
 
+@in_this_process
 def test_a_figure_that_json_has_not_stops_no_batch(slam_observer, recordings, tmp_path):
     out = tmp_path / 'results'
     grid = ('--grid', 'calibration_drift=0.01')
@@ -372,10 +367,11 @@ def test_a_figure_that_json_has_not_stops_no_batch(slam_observer, recordings, tm
     assert '<td>' in (out / 'index.html').read_text()
 
 
-def test_the_index_links_reports_and_sorts(slam_observer, tmp_path):
+@in_this_process
+def test_the_index_links_reports_and_sorts(slam_observer, beginning, tmp_path):
     out = tmp_path / 'results'
     grid = ('--grid', 'gains=constant,riccati', '--reports', '--trajectories')
-    slam_observer.succeed('batch', SAMPLE, *grid, '--out', out, '--workers', 1)
+    slam_observer.succeed('batch', beginning, *grid, '--out', out, '--workers', 1)
     page = out / 'index.html'
     for line in lines_of(out):
         assert (out / line['report']).stat().st_size > 100_000
@@ -443,6 +439,7 @@ def test_no_mean_hides_how_far_from_1_the_consistency_is(tmp_path):
     assert '1.28' not in page
 
 
+@in_this_process
 def test_a_run_that_used_nothing_is_seen_in_the_index(slam_observer, tmp_path):
     out, blind = tmp_path / 'results', tmp_path / 'blind.mcap'
     with RecordingWriter(blind) as writer:

@@ -79,9 +79,11 @@ def figures_of(lines):
 
 
 @pytest.mark.timeout(400)  # Dask takes long to start on a busy machine
-def test_a_cluster_that_loses_a_worker_does_every_run_once(cluster, slam_observer, tmp_path):
+def test_a_cluster_that_loses_a_worker_does_every_run_once(
+    cluster, slam_observer, no_processes, beginning, tmp_path
+):
     remote, local = tmp_path / 'remote', tmp_path / 'local'
-    command = [sys.executable, '-m', 'slam_observer_ros.cli.main', 'batch', str(SAMPLE), *GRID]
+    command = [sys.executable, '-m', 'slam_observer_ros.cli.main', 'batch', str(beginning), *GRID]
     batch = subprocess.Popen(
         [*command, '--out', str(remote), '--scheduler', cluster.address, '--trajectories']
     )
@@ -95,7 +97,7 @@ def test_a_cluster_that_loses_a_worker_does_every_run_once(cluster, slam_observe
     assert batch.wait(PATIENCE_S) == 0
     lines = read_logs(remote)
     assert len((remote / 'runs.jsonl').read_text().splitlines()) == len(lines) == RUNS
-    slam_observer.succeed('batch', SAMPLE, *GRID, '--out', local, '--trajectories')
+    slam_observer.succeed('batch', beginning, *GRID, '--out', local, '--trajectories')
     assert figures_of(lines) == figures_of(read_logs(local))
     for line in lines.values():
         file = line['trajectory']

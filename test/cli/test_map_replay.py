@@ -34,8 +34,9 @@ def record(
     receive_ns=lambda s: s * 10**8,
     truth=None,
     speed_factor=1.0,
+    steps=80,
 ):
-    """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
+    """Write a noisy drive, of 8 s at 10 Hz, that begins at ``start`` (4, 4), among 50 landmarks.
 
     At each step ids go up from ``first_id``, and the landmarks' world is ``scale`` times as large.
     Velocities are reported ``speed_factor`` times as large as they are.
@@ -45,7 +46,7 @@ def record(
     with RecordingWriter(path) as writer:
         if truth is not None:
             writer.write_landmarks(stamp_ns(0), truth)
-        for step in range(80):
+        for step in range(steps):
             noise = random.normal(scale=0.01, size=6)
             velocity = VelocityEvent(stamp_ns(step), speed_factor * BODY_VELOCITY + noise)
             writer.write_velocity(velocity, receive_stamp_ns=receive_ns(step))
@@ -202,7 +203,7 @@ class TestPoseInMapNotKnown:
     def test_a_place_never_found_leaves_nothing_but_the_reason(
         self, slam_observer, tmp_path, saved, more
     ):
-        other = record(tmp_path / 'other.mcap', np.eye(4), seed=2, first_id=lambda step: 100)
+        other = record(tmp_path / 'other.mcap', np.eye(4), 2, lambda step: 100, steps=20)
         poses, page, before = tmp_path / 'poses.tum', tmp_path / 'run.html', saved.read_bytes()
         error = slam_observer.fail(
             'replay', other, '--load-map', saved, '--map', saved, '--tum', poses, '--force',
@@ -264,21 +265,22 @@ class TestPoseInMapNotKnown:
         self, slam_observer, tmp_path, saved
     ):
         growing = record(
-            tmp_path / 'run.mcap', np.eye(4), seed=2, scale=lambda s: 3.0 if s % 4 else 1.0
+            tmp_path / 'run.mcap', np.eye(4), 2, scale=lambda s: 3.0 if s % 4 else 1.0, steps=40
         )
         ended = slam_observer('replay', growing, *SETTINGS)
         assert re.search('[0-9]+ % of the points were rejected: look at the signs', ended.errors)
 
     def test_a_scale_that_nobody_can_mean_is_reported(self, slam_observer, tmp_path, saved):
-        twice = record(tmp_path / 'run.mcap', np.eye(4), seed=2, speed_factor=2.0)
+        twice = record(tmp_path / 'run.mcap', np.eye(4), seed=2, speed_factor=2.0, steps=50)
         stated = '--set', 'linear_scale_stddev=[0.05,0.0,0.0]'
         ended = slam_observer('replay', twice, *SETTINGS, *stated)
         assert 'by the wheels ranges are 2.0' in ended.errors.lower()
 
     def test_a_place_lost_at_the_end_gives_poses_but_no_map(self, slam_observer, tmp_path, saved):
         misled = record(
-            tmp_path / 'misled.mcap', np.eye(4), seed=2, scale=lambda s: 10.0 if s >= 40 else 1.0
-        )
+            tmp_path / 'misled.mcap', np.eye(4), seed=2, steps=55,
+            scale=lambda s: 10.0 if s >= 40 else 1.0,
+        )  # fmt: skip
         poses, again = tmp_path / 'poses.tum', tmp_path / 'again.yaml'
         arguments = (
             'replay', misled, '--load-map', saved, '--tum', poses, *SETTINGS,
@@ -314,11 +316,13 @@ def test_points_of_no_landmark_of_a_map_that_does_not_grow_are_reported(
 ):
     """The map is of some twenty landmarks, whose ids are shared; of others they go up from 100."""
     first = record(tmp_path / 'first.mcap', np.eye(4), seed=1)
-    second = record(tmp_path / 'second.mcap', np.eye(4), 2, lambda s: 0 if s < 10 else 100)
+    others = record(
+        tmp_path / 'second.mcap', np.eye(4), 2, lambda s: 0 if s < 10 else 100, steps=30
+    )
     saved = tmp_path / 'map.yaml'
     slam_observer.succeed('replay', first, '--map', saved, *SETTINGS)
     errors = slam_observer(
-        'replay', second, '--load-map', saved, *SETTINGS,
+        'replay', others, '--load-map', saved, *SETTINGS,
         '--set', f'localization_mode={mode}', '--set', 'set_initial_pose=true',
     ).errors  # fmt: skip
     is_reported = (

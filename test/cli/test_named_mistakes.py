@@ -22,8 +22,8 @@ def known(tmp_path):
     return str(path)
 
 
-def recording(path, kind=None):
-    events = drive(seconds=50.0)
+def recording(path, kind=None, seconds=25.0):
+    events = drive(seconds=seconds)
     return str(write_events(path, list(MADE[kind].apply(events)) if kind else events))
 
 
@@ -49,13 +49,13 @@ def test_where_all_is_right_none_is_named(tmp_path, capsys, known):
 
 
 def test_that_no_pose_was_found_in_a_map_does_not_hide_it(tmp_path, capsys, known):
-    path = recording(tmp_path / 'run.mcap', 'points_in_millimetres')
+    path = recording(tmp_path / 'run.mcap', 'points_in_millimetres', seconds=10.0)
     assert main(['replay', path, *OPTIONS, '--load-map', known]) == 2
     assert 'was not found: The points are in millimetres' in capsys.readouterr().err
 
 
 def test_a_map_tells_a_mirror_image_from_a_wrong_sign(tmp_path, capsys, known):
-    path = recording(tmp_path / 'run.mcap', 'turning_negated')
+    path = recording(tmp_path / 'run.mcap', 'turning_negated', seconds=12.0)
     assert main(['doctor', path, '--json']) == 0
     assert kinds(capsys.readouterr().out) == {'points_mirrored', 'turning_negated'}
     assert main(['doctor', path, '--load-map', known, '--json']) == 0
