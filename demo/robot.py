@@ -238,7 +238,7 @@ def world_of(options: argparse.Namespace) -> World:
     if options.floor_codes:
         return replace(
             tags,
-            kind='code',
+            kind='codes',
             enough=1,
             params_file='config/floor_codes.yaml',
             landmarks=floor.code_poses(random),

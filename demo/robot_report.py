@@ -81,6 +81,9 @@ def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console
         console.print('robot: it was never localised', style='red')
         return False
     kind, enough = robot.world.kind, robot.world.enough
+    one, most = kind.removesuffix('s'), max(each.landmarks for each in robot.seen)
+    few = f'{enough} {kind}' if enough > 1 else one
+    in_view = f'{most} {kind} in view at most' if most > 1 else f'one {one} in view at a time'
     errors = np.array([error_of(*poses) for poses in located])
     position_m, heading_rad = _rms(errors[:, :2]), _rms(errors[:, 2:])
     sigma_m, sigma_rad, anees = _consistency(estimated)
@@ -90,11 +93,10 @@ def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console
     what = 'carried' if interruption.is_carried else 'restarted'
     console.print(
         table_of(
-            f'{robot.time_s:g} s in a hall with {max(e.landmarks for e in robot.seen)} {kind} in '
-            'view at most',
+            f'{robot.time_s:g} s in a hall with {in_view}',
             {
-                'lost until': f'{robot.corrections_s[0] - first_s:.2f} s after the first '
-                f'{enough} {kind} in view',
+                'lost until': f'{robot.corrections_s[0] - first_s:.2f} s after the first {few} '
+                'in view',
                 'map → odom': f'{reached_hz:.1f} a second, of {rate_hz:g} asked for',
                 'position error by /tf': f'{position_m:.3f} m RMS, '
                 f'{np.linalg.norm(errors[:, :2], axis=1).max():.3f} m at most; σ {sigma_m:.3f} m',
@@ -104,7 +106,7 @@ def report(robot: HallRobot, interruption: Interruption, rate_hz: float, console
                 f'{what} at {interruption.planned_s:g} s': 'not localised again'
                 if back_s is None
                 else f'localised again {interruption.moved_s:.2f} s after it drove on, '
-                f'by what it saw {back_s:.2f} s after the next {enough} {kind}',
+                f'by what it saw {back_s:.2f} s after the next {few}',
             },
         )
     )

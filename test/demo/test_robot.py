@@ -53,6 +53,7 @@ def test_the_robot_is_localised_before_and_after_what_happens_half_way(
             break
     assert exit_code == 0, output
     assert 'The robot was localised.' in output
+    assert '1 code' not in output  # but 'the first code', 'one code in view at a time'
 
 
 def test_the_page_on_nav2_has_the_command_that_is_run():
