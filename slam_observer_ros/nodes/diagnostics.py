@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 import time
-from typing import Any, Protocol, TypeAlias
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -14,20 +14,24 @@ from std_msgs.msg import Bool
 
 from slam_observer_ros.common.findings import Finding, in_brief, Level, worst_first
 from slam_observer_ros.common.stamps import to_ns
-from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event
-from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.input_topic import InputTopic
 from slam_observer_ros.nodes.ros_node import GuardedNode, LATCHED_QOS, ThrottledLog
 from slam_observer_ros.runs.corrections import driven_s, explained, ODOMETRY_CAUSES, SUSPICIOUS
 from slam_observer_ros.runs.health import estimator_values, of_all_learnt, of_fit
-from slam_observer_ros.runs.live_health import InputNumbers, localisation, of_node, Progress
-from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.runs.live_health import (
+    deviations,
+    InputNumbers,
+    localisation,
+    of_node,
+    Progress,
+)
+from slam_observer_ros.runs.mistakes import Search
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT_INNOVATIONS = (
@@ -87,7 +91,7 @@ class LocalisationStatus:
     def publish(self) -> None:
         """Publish, and log, whether the robot is localised, if that has changed."""
         share = FOUND_AGAIN if self._is_localised is False else 1.0
-        level, message = localisation(self._estimator, self._settings, self._deviations(), share)
+        level, message = localisation(self._estimator, self._settings, share)
         is_localised = level < Level.ERROR and self._estimator.stamp_ns is not None
         if is_localised == self._is_localised:
             return
@@ -106,13 +110,14 @@ class LocalisationStatus:
 
     def status(self, hardware_id: str, findings: Iterable[Finding]) -> DiagnosticStatus:
         """Return the status for /diagnostics, with those findings that nothing else explains."""
-        deviations = self._deviations()
-        level, message = localisation(self._estimator, self._settings, deviations)
+        level, message = localisation(self._estimator, self._settings)
         for finding in findings:
             if finding.level >= Level.WARNING:
                 level = max(level, Level.WARNING)
                 message = f'{message}; {finding.what}'
-        known = ('unknown', 'unknown') if deviations is None else [f'{d:.3f}' for d in deviations]
+        known = ['unknown'] * 2
+        if (known_to := deviations(self._estimator)) is not None:
+            known = [f'{each:.3f}' for each in known_to]
         values = {
             'map': self._estimator.map_name or 'none',
             'position, standard deviation [m]': known[0],
@@ -126,25 +131,6 @@ class LocalisationStatus:
             message=message,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
-
-    def _deviations(self) -> tuple[float, float] | None:
-        """Return standard deviations of position, m, and heading, rad; None if not known."""
-        if self._estimator.stamp_ns is None:
-            return None
-        covariance = self._estimator.pose_covariance
-        return None if covariance is None else deviations(covariance)
-
-
-def deviations(covariance: FloatArray) -> tuple[float, float]:
-    """Return standard deviations of position, in its worst direction, m, and of heading, rad.
-
-    ``covariance`` (6, 6) has rotation vector and position along the map's axes; both are
-    infinite if it is not finite.
-    """
-    if not np.isfinite(covariance).all():
-        return np.inf, np.inf
-    position_m2 = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    return float(np.sqrt(max(position_m2, 0.0))), float(np.sqrt(max(covariance[2, 2], 0.0)))
 
 
 WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000
@@ -160,18 +146,6 @@ PAUSE_S = 60.0
 """Time between two searches: before, most of the events are the same."""
 
 
-class Slices(Protocol):
-    """Looks for mistakes of a set-up, a part at a time (``runs/mistakes.py``)."""
-
-    findings: list[Finding]
-
-    def advance(self, seconds: float) -> bool:
-        """Go on for some time; return whether ``findings`` are known."""
-
-
-Begin: TypeAlias = Callable[[Settings, Sequence[Event], Sequence[LandmarkMap] | None], Slices]
-
-
 class MistakeWatch:
     """Keeps the events of late, and searches them for a mistake while there is reason for that.
 
@@ -184,12 +158,12 @@ class MistakeWatch:
 
     """
 
-    def __init__(self, node: Node, estimator: Estimate, begin_search: Begin) -> None:
+    def __init__(self, node: Node, estimator: Estimate, begin_search: type[Search]) -> None:
         self.findings: list[Finding] = []
         self._node = node
         self._estimator, self._begin_search = estimator, begin_search
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
-        self._search: Slices | None = None
+        self._search: Search | None = None
         self._next_s = 0.0
         self.timer = node.create_steady_timer(PERIOD_S, self._advance)
         self.timer.cancel()
@@ -259,20 +233,38 @@ class DiagnosticsPublisher:
         self._seen_s: float | None = None  # when a landmark was seen last
         self._said_empty = False
         self._since_s: dict[str, float] = {}  # when what is wrong was found first
-        self._last_received = {source.topic: 0 for source in inputs}
-        self._last_dropped: Counter[str] = Counter()
-        self._last_malformed: Counter[str] = Counter()
-        self._last_unstamped: Counter[str] = Counter()
-        self._last_counts: Counter[str] = Counter()
+        self._last: dict[str, Counter[str]] = {}  # what was counted so far, by what it is of
         self._recent_counts: deque[Counter[str]] = deque(maxlen=RECENT)
 
     def publish(self) -> None:
         """Publish the status of the estimate and of the localisation, about once a second."""
-        dropped, new = self._progress()
-        symptoms = self._findings(dropped, new)
+        shed = Counter(overload=sum(source.shedding.shed for source in self._inputs))
+        unused = self._estimator.dropped + self._feed.dropped + shed
+        malformed = Counter({source.topic: source.malformed for source in self._inputs})
+        dropped = self._new('dropped', unused + Counter(malformed=malformed.total()))
+        new = self._new('used', self._estimator.counts)
+        self._recent_counts.append(new)
+        now_s = time.monotonic()
+        if new['observed_point']:
+            self._seen_s = now_s
+        symptoms = of_node(
+            self._estimator,
+            self._numbers(self._new('malformed', malformed)),
+            Progress(
+                dropped,
+                new,
+                self._new('unstamped', self._feed.unstamped),
+                sum(self._recent_counts, Counter()),
+                is_paused=self._feed.is_paused,
+                has_seen=self._seen_s is not None,
+            ),
+        )
+        for finding in symptoms:
+            if finding.kind == 'empty_messages' and not self._said_empty:
+                self._said_empty = True
+                self._node.get_logger().warning(finding.text())
         of_both = explained([*symptoms, *self._localisation.findings])
-        disturbs = any(each.kind in ODOMETRY_CAUSES for each in symptoms)
-        if disturbs:
+        if any(each.kind in ODOMETRY_CAUSES for each in symptoms):
             self._estimator.distrust_odometry()
             self._watch.look([], has_slipped=False)
         else:
@@ -286,9 +278,13 @@ class DiagnosticsPublisher:
         problems = worst_first(findings, self._faults())
         if problems:
             level = max(level, Level.WARNING)
-        now_s = time.monotonic()
         self._since_s = {each.kind: self._since_s.get(each.kind, now_s) for each in findings}
-        values = self._input_values() | self._estimator_values(findings)
+        values = self._input_values(now_s - self._last_time_s)
+        self._last_time_s = now_s
+        values |= estimator_values(self._estimator, unused, findings)
+        seen_s = 'never' if self._seen_s is None else f'{now_s - self._seen_s:.0f}'
+        values['landmarks seen, age [s]'] = seen_s
+        values['processing time, mean [ms]'] = f'{self._feed.take_mean_processing_ms():.3f}'
         values |= {f'problem {i}': problem for i, problem in enumerate(problems, start=1)}
         values |= {f'{kind}, for [s]': f'{now_s - t:.0f}' for kind, t in self._since_s.items()}
         status = DiagnosticStatus(
@@ -304,52 +300,15 @@ class DiagnosticsPublisher:
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 
-    def _input_values(self) -> dict[str, str]:
-        now_s = time.monotonic()
-        elapsed_s = now_s - self._last_time_s
-        self._last_time_s = now_s
-        values = {}
-        for source in self._inputs:
-            new = source.received - self._last_received[source.topic]
-            self._last_received[source.topic] = source.received
-            age = 'never' if source.age_s is None else f'{source.age_s:.3f}'
-            values[f'{source.topic} rate [Hz]'] = f'{new / elapsed_s:.1f}'
-            values[f'{source.topic} age [s]'] = age
-            values[f'{source.topic} wait [s]'] = f'{source.backlog.wait_s:.3f}'
-            if source.malformed:
-                values[f'{source.topic} malformed'] = str(source.malformed)
-        if (age_s := self._estimate_publisher.odometry_age_s) is not None:
-            values['odometry on /tf age [s]'] = f'{age_s:.3f}'
-        return values
+    def _new(self, what: str, counts: Counter[str]) -> Counter[str]:
+        """Return what was counted since the last time."""
+        before = self._last.get(what, Counter())
+        self._last[what] = counts.copy()
+        return counts - before
 
-    def _estimator_values(self, findings: Sequence[Finding]) -> dict[str, str]:
-        values = estimator_values(self._estimator, self._dropped(), findings)
-        age_s = 'never' if self._seen_s is None else f'{time.monotonic() - self._seen_s:.0f}'
-        values['landmarks seen, age [s]'] = age_s
-        values['processing time, mean [ms]'] = f'{self._feed.take_mean_processing_ms():.3f}'
-        return values
-
-    def _progress(self) -> tuple[Counter[str], Counter[str]]:
-        """Return why messages were dropped since the last time, and what else was counted."""
-        dropped = self._dropped()
-        dropped['malformed'] += sum(source.malformed for source in self._inputs)
-        counts = self._estimator.counts
-        since_last = dropped - self._last_dropped, counts - self._last_counts
-        self._last_dropped, self._last_counts = dropped, counts
-        if since_last[1]['observed_point']:
-            self._seen_s = time.monotonic()
-        return since_last
-
-    def _dropped(self) -> Counter[str]:
-        """Return why messages that could be read were not used."""
-        shed = Counter(overload=sum(source.shedding.shed for source in self._inputs))
-        return self._estimator.dropped + self._feed.dropped + shed
-
-    def _findings(self, dropped: Counter[str], new: Counter[str]) -> list[Finding]:
-        """Return what is wrong by what was counted since the last time."""
-        malformed = Counter({source.topic: source.malformed for source in self._inputs})
-        unreadable, unstamped = malformed - self._last_malformed, self._feed.unstamped
-        inputs = [
+    def _numbers(self, unreadable: Counter[str]) -> list[InputNumbers]:
+        """Return what is known of the inputs; of ``unreadable`` ones, also what was wrong."""
+        return [
             InputNumbers(
                 source.name,
                 source.topic,
@@ -361,29 +320,29 @@ class DiagnosticsPublisher:
             )
             for source in self._inputs
         ]
-        self._recent_counts.append(new)
-        progress = Progress(
-            dropped,
-            new,
-            unstamped - self._last_unstamped,
-            sum(self._recent_counts, Counter()),
-            is_paused=self._feed.is_paused,
-            has_seen=self._seen_s is not None,
-        )
-        self._last_malformed, self._last_unstamped = malformed, unstamped.copy()
-        findings = of_node(self._estimator, inputs, progress)
-        for finding in findings:
-            if finding.kind == 'empty_messages' and not self._said_empty:
-                self._said_empty = True
-                self._node.get_logger().warning(finding.text())
-        return findings
+
+    def _input_values(self, elapsed_s: float) -> dict[str, str]:
+        values = {}
+        new = self._new('received', Counter({each.topic: each.received for each in self._inputs}))
+        for source in self._inputs:
+            age = 'never' if source.age_s is None else f'{source.age_s:.3f}'
+            values[f'{source.topic} rate [Hz]'] = f'{new[source.topic] / elapsed_s:.1f}'
+            values[f'{source.topic} age [s]'] = age
+            values[f'{source.topic} wait [s]'] = f'{source.backlog.wait_s:.3f}'
+            if source.malformed:
+                values[f'{source.topic} malformed'] = str(source.malformed)
+        if (age_s := self._estimate_publisher.odometry_age_s) is not None:
+            values['odometry on /tf age [s]'] = f'{age_s:.3f}'
+        return values
 
     def _faults(self) -> list[str]:
         """Return what inputs, clocks and publishers report of themselves, with what to do."""
-        faults = [source.problem for source in self._inputs]
-        faults += self._feed.clock_problems()
-        faults.append(self._estimate_publisher.early_odometry())
-        faults.append(self._estimate_publisher.rivals())
-        faults.append(self._estimate_publisher.problem)
-        faults.append(self._node.last_failure)
+        faults = [
+            *(source.problem for source in self._inputs),
+            *self._feed.clock_problems(),
+            self._estimate_publisher.early_odometry(),
+            self._estimate_publisher.rivals(),
+            self._estimate_publisher.problem,
+            self._node.last_failure,
+        ]
         return [fault for fault in faults if fault]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -36,7 +36,7 @@ from slam_observer_ros.recordings.frames import BaseFrame, TransformBuffer
 from slam_observer_ros.runs.mistakes import Search
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
-from slam_observer_ros.settings.parameter_table import changed_names
+from slam_observer_ros.settings.parameter_table import changed_names, table
 
 RETRY_PERIOD_S = 0.02
 
@@ -98,7 +98,7 @@ class DataFlow:
             self.estimator,
             BaseFrame(settings, self.buffer),
             on_events=self._publish_new,
-            on_waiting=self._begin_to_retry,
+            on_waiting=lambda: _start(self._retry_timer),
             note_event=self.watch.note,
         )
         self.inputs = open_inputs(node, settings, self.feed)
@@ -132,17 +132,14 @@ class DataFlow:
         # With what is still to be used; a little later, if nothing comes of that.
         has_more = self._are_late_if_they_wait and any(each.has_more for each in self.inputs)
         if not has_more and self.output.is_due(source):
-            self._catch_up()
+            # What is published is not old: what waits is used, and published with it.
+            self._is_catching_up = True
+            self._read_waiting(but_landmarks=not self._are_late_if_they_wait)
+            self._is_catching_up = False
+            self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
             self.output.publish_state(source)
         if self._must_publish:
             _start(self._publish_timer)
-
-    def _catch_up(self) -> None:
-        """Use what waits, so that what is published is not old."""
-        self._is_catching_up = True  # their events are published with it
-        self._read_waiting(but_landmarks=not self._are_late_if_they_wait)
-        self._is_catching_up = False
-        self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
 
     def _read_waiting(self, but_landmarks: bool = False) -> None:
         """Use what waits, in the order in which it was received."""
@@ -163,9 +160,6 @@ class DataFlow:
         """Whether something is to be published though nothing comes in."""
         return self.feed.is_active and (self.feed.is_paused or self.output.is_waiting)
 
-    def _begin_to_retry(self) -> None:
-        _start(self._retry_timer)
-
     def _retry(self) -> None:
         self.feed.retry()
         if not self.feed.is_waiting:
@@ -173,7 +167,7 @@ class DataFlow:
 
 
 def _start(timer: Timer) -> None:
-    """Let a timer run, unless it does."""
+    """Start a timer that is stopped."""
     if timer.is_canceled():
         timer.reset()
 
@@ -226,7 +220,14 @@ class ObserverCore:
             hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         self._offer_services(settings)
-        self._timers = [*flow.timers, *self._create_timers()]
+        create = node.create_steady_timer
+        self._timers = [
+            *flow.timers,
+            create(CHECK_PERIOD_S, self._check),
+            create(OVERVIEW_PERIOD_S, self._publish_overview),
+            create(DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
+            create(KEEP_PERIOD_S, self._kept_pose.keep),
+        ]
         self.stop()
         # The clock forgets a handle that nobody holds.
         self._jump_handle = node.get_clock().create_jump_callback(
@@ -235,7 +236,10 @@ class ObserverCore:
                 min_backward=Duration(nanoseconds=-CLOCK_JITTER_NS),
                 on_clock_change=False,
             ),
-            post_callback=node.guarded(self._on_clock_jump, 'a jump of the clock'),
+            post_callback=node.guarded(
+                lambda jump: flow.handle_clock_jump(jump.delta.nanoseconds),
+                'a jump of the clock',
+            ),
         )
         changed = len(changed_names(estimator_settings)) + len(changed_names(settings))
         node.get_logger().info(
@@ -291,15 +295,6 @@ class ObserverCore:
         InitialPoseListener(node, settings.map_frame, flow.estimator, odometry, controls.note_move)
         node.add_post_set_parameters_callback(self._apply_parameters)
 
-    def _create_timers(self) -> list[Timer]:
-        create = self._node.create_steady_timer
-        return [
-            create(CHECK_PERIOD_S, self._check),
-            create(OVERVIEW_PERIOD_S, self._publish_overview),
-            create(DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
-            create(KEEP_PERIOD_S, self._kept_pose.keep),
-        ]
-
     def _check(self) -> None:
         if not self._is_finite():
             self._log.error(
@@ -326,8 +321,7 @@ class ObserverCore:
         self._flow.output.publish_overview()
         self._maps.keep_recent()
 
-    def _on_clock_jump(self, jump: TimeJump) -> None:
-        self._flow.handle_clock_jump(jump.delta.nanoseconds)
-
-    def _apply_parameters(self, _changes: list[Parameter]) -> None:
-        self._flow.estimator.change_settings(read_settings(self._node, Settings))
+    def _apply_parameters(self, changes: list[Parameter]) -> None:
+        # Not of those that rclpy itself declares, as qos_overrides.
+        if not {change.name for change in changes}.isdisjoint(row.name for row in table(Settings)):
+            self._flow.estimator.change_settings(read_settings(self._node, Settings))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 import dataclasses
 import importlib
 from pathlib import Path
@@ -196,10 +197,14 @@ class MapServices:
             node.get_logger().info(self._load(absolute(settings.map_file)))
         elif estimator.settings.localization_mode != 'off':
             node.get_logger().warning("no 'map_file': mapping until a map comes by ~/load_map")
-        self._warn_of_another(settings.map_path)
+        if self._autosave and self._is_another(path := absolute(settings.map_path)):
+            node.get_logger().warning(
+                f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
+                f'holds will be kept in {_backup(path).name}'
+            )
         node.add_on_set_parameters_callback(self._check_changes)
-        node.create_service(Trigger, '~/save_map', self._answer_save)
-        node.create_service(Trigger, '~/load_map', self._answer_load)
+        node.create_service(Trigger, '~/save_map', lambda _, answer: self.save_to('', answer))
+        node.create_service(Trigger, '~/load_map', lambda _, answer: self.load_from('', answer))
 
     def save_at_end(self) -> None:
         """Save the map if that was asked for and there is one; MapError if it can't be saved.
@@ -270,27 +275,8 @@ class MapServices:
             raise ParameterError("'autosave_map' needs a file in 'map_path'")
         check_writable(absolute(map_path))
 
-    def _warn_of_another(self, map_path: str) -> None:
-        """Warn that the map of the end will replace one that is not loaded."""
-        path = absolute(map_path)
-        if self._autosave and self._is_another(path):
-            self._node.get_logger().warning(
-                f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
-                f'holds will be kept in {_backup(path).name}'
-            )
-
     def _is_another(self, path: Path) -> bool:
         return path not in self._own_files and is_there(path)
-
-    def _answer_save(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        return self.save_to('', response)
-
-    def _answer_load(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        return self.load_from('', response)
 
     def _answer(
         self, response: Trigger.Response, act: Callable[[Path], str], path: str = ''
@@ -300,8 +286,7 @@ class MapServices:
             response.success = True
             self._node.get_logger().info(response.message)
         except SlamObserverError as error:
-            response.message = str(error)
-            response.success = False
+            response.message, response.success = str(error), False
             self._node.get_logger().error(response.message)
         return response
 
@@ -351,20 +336,17 @@ class MapServices:
         what = f'{sum(len(known.ids) for known in maps)} landmarks'
         if len(maps) > 1:
             what += f' in {len(maps)} maps ({", ".join(known.name for known in maps)})'
-        return f'loaded {what} from {path}; {self._pose_in_map()}'
-
-    def _pose_in_map(self) -> str:
-        estimator = self._estimator
-        if not estimator.is_localised:
-            number = 'two' if estimator.settings.two_d_mode else 'three'
-            return (
+        pose = 'the robot has found its pose in it'
+        if not self._estimator.is_localised:
+            number = 'two' if self._estimator.settings.two_d_mode else 'three'
+            pose = (
                 f'the pose is unknown until {number} of them are recognised by their ids, more '
                 'without ids by how they lie to each other, or it is given on initialpose'
             )
-        if estimator.last_update is None:
-            x, y, z = estimator.pose[:3, 3].tolist()
-            return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
-        return 'the robot has found its pose in it'
+        elif self._estimator.last_update is None:
+            x, y, z = self._estimator.pose[:3, 3].tolist()
+            pose = f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
+        return f'loaded {what} from {path}; {pose}'
 
 
 def _backup(path: Path) -> Path:
@@ -372,8 +354,6 @@ def _backup(path: Path) -> Path:
 
 
 _FILE_URL = re.compile('file:(?://(?:localhost)?)?(/(?!/).*)', re.IGNORECASE | re.DOTALL)
-
-SAVE, LOAD = '~/save_map_to', '~/load_map_from'
 
 
 class NamedMapServices:
@@ -389,20 +369,21 @@ class NamedMapServices:
             types = importlib.import_module('nav2_msgs.srv')
         except ImportError:  # the services of std_srvs do the same, with the parameter map_path
             return
-        node.create_service(types.SaveMap, SAVE, self._save)
-        node.create_service(types.LoadMap, LOAD, self._load)
+        node.create_service(types.SaveMap, '~/save_map_to', self._save)
+        node.create_service(types.LoadMap, '~/load_map_from', self._load)
 
     def _save(self, request: Any, response: Any) -> Any:
         response.result = self._succeeds(self._maps.save_to, request.map_url)
         return response
 
     def _load(self, request: Any, response: Any) -> Any:
+        response.result = response.RESULT_MAP_DOES_NOT_EXIST
         if self._succeeds(self._maps.load_from, request.map_url):
             response.result = response.RESULT_SUCCESS
-        elif _is_there(request.map_url):
-            response.result = response.RESULT_INVALID_MAP_DATA
-        else:
-            response.result = response.RESULT_MAP_DOES_NOT_EXIST
+            return response
+        with suppress(SlamObserverError):
+            if is_there(absolute(path_of(request.map_url))):
+                response.result = response.RESULT_INVALID_MAP_DATA
         return response
 
     def _succeeds(self, act: Callable[..., Trigger.Response], map_url: str) -> bool:
@@ -412,13 +393,6 @@ class NamedMapServices:
             self._log.error(str(error))
             return False
         return bool(act(path, Trigger.Response()).success)
-
-
-def _is_there(map_url: str) -> bool:
-    try:
-        return is_there(absolute(path_of(map_url)))
-    except SlamObserverError:
-        return False
 
 
 def path_of(map_url: str) -> str:

@@ -8,8 +8,11 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 from statistics import median_low
 from typing import Any
+
+import numpy as np
 
 from slam_observer_ros.common.findings import fault, Finding, found, Level
 from slam_observer_ros.common.stamps import is_of_1970, to_s
@@ -114,13 +117,24 @@ def _of_place(estimator: Estimate) -> list[Finding]:
     return [*findings, problem] if problem and is_by_place else findings
 
 
+def deviations(estimator: Estimate) -> tuple[float, float] | None:
+    """Return standard deviations of position, in its worst direction, m, and of heading, rad.
+
+    None if they are not known, and infinite if the covariance is not finite.
+    """
+    covariance = None if estimator.stamp_ns is None else estimator.pose_covariance
+    if covariance is None:
+        return None
+    if not np.isfinite(covariance).all():
+        return np.inf, np.inf
+    variances_m2 = np.linalg.eigvalsh(covariance[3:, 3:])
+    return math.sqrt(max(variances_m2[-1], 0.0)), math.sqrt(max(covariance[2, 2], 0.0))
+
+
 def localisation(
-    estimator: Estimate,
-    limits: ObserverNodeSettings,
-    deviations: tuple[float, float] | None,
-    share: float = 1.0,
+    estimator: Estimate, limits: ObserverNodeSettings, share: float = 1.0
 ) -> tuple[Level, str]:
-    """Judge, in words too, how well the pose is known, by its standard deviations (m, rad).
+    """Judge, in words too, how well the pose is known.
 
     The robot is lost from a share of the error level on.
     """
@@ -132,12 +146,12 @@ def localisation(
         return Level.ERROR, found('contradicted_pose').what
     if estimator.map_name and estimator.ambiguity is not None:
         return Level.ERROR, 'what is seen fits several places of the map'
-    if deviations is None:
+    if (known := deviations(estimator)) is None:
         return Level.NOTE, 'localised; the gains know no standard deviation'
     worst, reasons = Level.NOTE, []
     for name, value, unit, (warn, lost) in (
-        ('position', deviations[0], 'm', limits.position_limits),
-        ('heading', deviations[1], 'rad', limits.heading_limits),
+        ('position', known[0], 'm', limits.position_limits),
+        ('heading', known[1], 'rad', limits.heading_limits),
     ):
         error = share * lost
         if value > min(warn, error):
