@@ -50,11 +50,11 @@ QUEUE_DEPTH = 100
 
 def open_inputs(
     node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
-) -> list[InputTopic[Any]]:
+) -> list[InputTopic]:
     """Subscribe to what the parameters name; ParameterError if a type's package is missing."""
     velocity = _velocity_input(node, settings, feed)
     landmarks = _landmark_input(node, settings, feed)
-    imu: list[InputTopic[Any]] = []
+    imu: list[InputTopic] = []
     if settings.use_imu:
         of_imu = decoders('angular velocity')
         imu.append(InputTopic(node, 'imu', of_imu, partial(feed.add, 'imu'), _qos()))
@@ -62,9 +62,7 @@ def open_inputs(
     return [velocity, landmarks, *imu]
 
 
-def _velocity_input(
-    node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
-) -> InputTopic[Any]:
+def _velocity_input(node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed) -> InputTopic:
     if settings.velocity_source == POSE_DIFFERENCES:
         if settings.velocity_type not in (AUTO, 'Odometry'):
             raise ParameterError(
@@ -79,9 +77,7 @@ def _velocity_input(
     return InputTopic(node, 'twist', chosen, partial(feed.add, 'twist'), _qos())
 
 
-def _landmark_input(
-    node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
-) -> InputTopic[Any]:
+def _landmark_input(node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed) -> InputTopic:
     name = 'landmarks'
     take: Callable[[Any, int], None] = feed.add_observation
     chosen: dict[str, Any]

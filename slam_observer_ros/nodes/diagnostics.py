@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 import time
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -214,7 +213,7 @@ class DiagnosticsPublisher:
         node: GuardedNode,
         estimator: Estimator,
         feed: EstimatorFeed,
-        inputs: Sequence[InputTopic[Any]],
+        inputs: Sequence[InputTopic],
         estimate_publisher: EstimatePublisher,
         localisation: LocalisationStatus,
         watch: MistakeWatch,

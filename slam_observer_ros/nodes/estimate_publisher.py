@@ -48,8 +48,8 @@ jitter, and by which other inputs wait for it."""
 class Pace:
     """Allows a state at most at a rate, at the times at which one input gives them.
 
-    That is the one that gave the last. What others give in between comes out with its next: it
-    would take the turn of that, which would then wait for the one after it.
+    The rate follows the input that produced the last published state. States from other inputs
+    wait for that input's next one.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -188,7 +188,9 @@ class EstimatePublisher:
         pose = self._publish_pose(stamp_ns)
         if self.broadcaster is not None:
             self.broadcaster.add(stamp_ns, pose)
-        self._extend_path(stamp_ns, pose)
+        if is_due(stamp_ns, self._path_stamp_ns, PATH_SPACING_NS):
+            self._path_stamp_ns = stamp_ns
+            self._path.append(self._messages.path_pose(stamp_ns, pose))
         # What nobody reads, and nobody can read later, is not made.
         if self._lyapunov.get_subscription_count():
             self._lyapunov.publish(self._messages.value(self._estimator.lyapunov))
@@ -206,7 +208,9 @@ class EstimatePublisher:
         if not self._is_new(self._slow_stamp_ns):
             return
         self._slow_stamp_ns = stamp_ns
-        self._keep_pose(stamp_ns)
+        if not self._pose.get_subscription_count():  # it is kept for whoever comes later
+            uncertain = uncertain_pose(*self._estimator.uncertain_pose)
+            self._pose.publish(self._state.pose(stamp_ns, uncertain))
         if self._path_publisher.get_subscription_count():
             self._path_publisher.publish(self._messages.path(stamp_ns, self._path))
         self._publish_landmarks(stamp_ns)
@@ -249,9 +253,8 @@ class EstimatePublisher:
     def _publish_pose(self, stamp_ns: int) -> FloatArray:
         """Publish pose and odometry where they are read; return the pose (4, 4)."""
         estimator = self._estimator
-        poses, odometries = (
-            publisher.get_subscription_count() for publisher in (self._pose, self._odometry)
-        )
+        poses = self._pose.get_subscription_count()
+        odometries = self._odometry.get_subscription_count()
         if not (poses or odometries):
             return estimator.pose
         pose, covariance = estimator.uncertain_pose
@@ -262,12 +265,6 @@ class EstimatePublisher:
             velocity = estimator.body_velocity, estimator.body_velocity_covariance
             self._odometry.publish(self._state.odometry(stamp_ns, uncertain, *velocity))
         return pose
-
-    def _keep_pose(self, stamp_ns: int) -> None:
-        """Publish the pose, while nobody reads it, for whoever comes later."""
-        if not self._pose.get_subscription_count():
-            uncertain = uncertain_pose(*self._estimator.uncertain_pose)
-            self._pose.publish(self._state.pose(stamp_ns, uncertain))
 
     def _publish_landmarks(self, stamp_ns: int) -> None:
         estimator = self._estimator
@@ -294,8 +291,3 @@ class EstimatePublisher:
         points = self._estimator.world_points
         raw = encode_point_cloud(stamp_ns, self._settings.map_frame, ids, points)
         self._estimates.publish(raw)
-
-    def _extend_path(self, stamp_ns: int, pose: FloatArray) -> None:
-        if is_due(stamp_ns, self._path_stamp_ns, PATH_SPACING_NS):
-            self._path_stamp_ns = stamp_ns
-            self._path.append(self._messages.path_pose(stamp_ns, pose))

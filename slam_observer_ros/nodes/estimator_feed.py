@@ -227,7 +227,10 @@ class EstimatorFeed:
         timed = with_receive_time(measured, receive_ns)
         stamp_ns = timed.stamp_ns + (clock.correction_ns if is_corrected else 0)
         use = partial(self._use, name, timed, receive_ns)
-        if self._change.hold(use, stamp_ns, receive_ns, self._usable_from_ns):
+        window, late = self._estimator.settings.reorder_window, self._estimator.settings.late_limit
+        # Before this an event would be refused as too late.
+        usable_from_ns = (self._estimator.newest_stamp_ns or 0) - to_ns(window + late)
+        if self._change.hold(use, stamp_ns, receive_ns, usable_from_ns):
             return True
         if self._change.is_over(stamp_ns, receive_ns):
             self.dropped['last_run'] += 1
@@ -247,16 +250,15 @@ class EstimatorFeed:
 
     def add_observation(self, measured: ObservationEvent, receive_ns: int) -> None:
         """Take landmarks, unless they are a lidar's scan."""
-        problem = scan_problem(measured)
-        if self.is_active and problem:
+        if self.is_active and (problem := scan_problem(measured)):
             self._drop('scan', problem)
-        else:
-            count, most = len(measured.ids), self._estimator.settings.max_points
-            if count > most:
-                topic = self._topics['landmarks']
-                subject = f'points of {topic}'
-                self._log.event('surplus_point', subject, source=topic, count=count, most=most)
-            self.add('landmarks', measured, receive_ns)
+            return
+        count, most = len(measured.ids), self._estimator.settings.max_points
+        if count > most:
+            topic = self._topics['landmarks']
+            subject = f'points of {topic}'
+            self._log.event('surplus_point', subject, source=topic, count=count, most=most)
+        self.add('landmarks', measured, receive_ns)
 
     def add_observations(self, measured: Sequence[ObservationEvent], receive_ns: int) -> None:
         """Take landmarks of several cameras."""
@@ -287,13 +289,6 @@ class EstimatorFeed:
         return clock.problem(f'{self._topics[name]}{whose}', self._is_simulated)
 
     @property
-    def _usable_from_ns(self) -> int:
-        """Stamp before which an event is refused as too late, nanoseconds."""
-        settings = self._estimator.settings
-        reach_ns = to_ns(settings.reorder_window + settings.late_limit)
-        return (self._estimator.newest_stamp_ns or 0) - reach_ns
-
-    @property
     def _is_simulated(self) -> bool:
         return bool(self._node.get_clock().ros_time_is_active)
 
@@ -304,8 +299,16 @@ class EstimatorFeed:
         return mean_s * 1e3
 
     def _give(self, events: list[Event], name: str) -> None:
-        # All before the first is used: if that shows a jump of the clock, offsets are forgotten.
-        for event in [self._in_own_time(event) for event in events]:
+        # Not corrected before: what places the sensor on /tf has, as a rule, stamps of the same
+        # clock. All before the first is used: if that shows a jump of the clock, offsets go.
+        is_corrected, now_ns = self._settings.correct_clock_offset, time.monotonic_ns()
+        corrections_ns = [
+            self.clocks[SOURCES[type(each)]].correction_ns if is_corrected else 0
+            for each in events
+        ]
+        for measured, correction_ns in zip(events, corrections_ns, strict=True):
+            stamp_ns = measured.stamp_ns + correction_ns
+            event = replace(measured, stamp_ns=stamp_ns, receive_ns=now_ns)
             start_s = time.perf_counter()
             self._note_event(event)
             try:
@@ -316,13 +319,6 @@ class EstimatorFeed:
             self._processed += 1
         if events:
             self.on_events(name)
-
-    def _in_own_time(self, event: Event) -> Event:
-        stamp_ns = event.stamp_ns
-        if self._settings.correct_clock_offset:
-            # Not before: what places the sensor on /tf has, as a rule, stamps of the same clock.
-            stamp_ns += self.clocks[SOURCES[type(event)]].correction_ns
-        return replace(event, stamp_ns=stamp_ns, receive_ns=time.monotonic_ns())
 
     def _drop_measured(self, error: DropError) -> None:
         is_unplaced = isinstance(error, TransformError)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 import time
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeAlias
 
 from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
@@ -43,9 +43,7 @@ HELD_UP_S = 1.0
 
 MAX_FULL_NAMES = 3  # of message types in a log line
 
-MessageT = TypeVar('MessageT')
-Decoder = Callable[[Buffer, int], MessageT]
-
+Decoder: TypeAlias = Callable[[Buffer, int], Any]
 
 TRY_S = 2.0
 """How long a type that has not come yet is waited for while others are published as well."""
@@ -64,6 +62,8 @@ class TypeChoice:
     ----------
     chosen : str
         The type that is listened for; '' before the first.
+    have_come : set of str
+        Types of which there was a message.
 
     """
 
@@ -71,7 +71,7 @@ class TypeChoice:
         self.chosen = ''
         self._since_s = 0.0
         self._tried: set[str] = set()
-        self._have_come: set[str] = set()
+        self.have_come: set[str] = set()
 
     def choose(self, type_name: str, now_s: float) -> bool:
         """Note that a type is listened for; return whether it is for the first time."""
@@ -80,15 +80,11 @@ class TypeChoice:
         self._tried.add(type_name)
         return is_new
 
-    def note_message(self) -> None:
-        """Note that the chosen type has come."""
-        self._have_come.add(self.chosen)
-
     def best_of(self, published: Sequence[str], last_s: float, now_s: float) -> str:
         """Return which of the published types to listen for, by the time of the last message."""
         if self.chosen not in published:
             return published[0]
-        patience_s = KEEP_S if self.chosen in self._have_come else TRY_S
+        patience_s = KEEP_S if self.chosen in self.have_come else TRY_S
         if now_s - max(self._since_s, last_s) < patience_s:
             return self.chosen
         return published[(published.index(self.chosen) + 1) % len(published)]
@@ -145,7 +141,11 @@ class LoadShedding:
         oldest_ns = min((each.received_ns for each in waiting if each.received_ns), default=now_ns)
         kept = list(waiting)
         if to_s(now_ns - oldest_ns) > self._max_wait_s:
-            kept = _newest_of_each_sensor(waiting)
+            kept, seen = [], set[str]()
+            for each in reversed(waiting):
+                if not each.sensors or each.sensors - seen:  # without any, as on /tf, it is cheap
+                    kept.insert(0, each)
+                seen |= each.sensors
         shed = len(waiting) - len(kept)
         self.shed += shed
         self._recent.append((now_s, len(waiting), shed))
@@ -163,19 +163,7 @@ class LoadShedding:
             self._recent.popleft()
 
 
-def _newest_of_each_sensor(waiting: Sequence[Waiting]) -> list[Waiting]:
-    """Return the messages without those all of whose sensors have newer ones."""
-    kept: list[Waiting] = []
-    seen: set[str] = set()
-    for each in reversed(waiting):
-        sensors = each.sensors
-        if not sensors or sensors - seen:  # without any it costs nothing, as on /tf
-            kept.append(each)
-        seen |= sensors
-    return kept[::-1]
-
-
-class InputTopic(Generic[MessageT]):
+class InputTopic:
     """Subscribes to a topic, decodes its messages and reports why none come.
 
     Parameters
@@ -223,8 +211,8 @@ class InputTopic(Generic[MessageT]):
         self,
         node: Node,
         name: str,
-        decoders: Mapping[str, Decoder[MessageT]],
-        on_message: Callable[[MessageT, int], None],
+        decoders: Mapping[str, Decoder],
+        on_message: Callable[[Any, int], None],
         qos: QoSProfile,
         max_wait_s: float = math.inf,
     ) -> None:
@@ -235,7 +223,7 @@ class InputTopic(Generic[MessageT]):
         self.has_more = False
         self.is_shared = False
         self.advice: Mapping[str, str] = {}
-        self.read_first: Sequence[InputTopic[Any]] = ()
+        self.read_first: Sequence[InputTopic] = ()
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
         self._types = TypeChoice()
@@ -305,7 +293,13 @@ class InputTopic(Generic[MessageT]):
         a topic has fallen silent is logged once, until it is heard again.
         """
         age_s, now_s = self.age_s, time.monotonic()
-        self._note_look(now_s)
+        # Whether the node was held up, or /clock has stood still, since the last look
+        if now_s - self._looked_s > HELD_UP_S and (self.last_received_s or 0.0) <= self._looked_s:
+            self._held_s, self._resumed_s = now_s - self._looked_s, now_s
+        self._looked_s = now_s
+        clock_ns = self._node.get_clock().now().nanoseconds
+        if clock_ns != self._clock_ns:
+            self._clock_ns, self._clock_since_s = clock_ns, now_s
         is_well = age_s is not None and age_s < WELL_S and not self._fault
         if is_well and now_s < self._checked_s + WELL_S:
             return
@@ -338,21 +332,6 @@ class InputTopic(Generic[MessageT]):
         """Note that topics were not to be looked at up to now."""
         self._looked_s = time.monotonic()
 
-    def _note_look(self, now_s: float) -> None:
-        """Note whether the node was held up, or /clock has stood still, since the last look."""
-        if now_s - self._looked_s > HELD_UP_S and (self.last_received_s or 0.0) <= self._looked_s:
-            self._held_s, self._resumed_s = now_s - self._looked_s, now_s
-        self._looked_s = now_s
-        clock_ns = self._node.get_clock().now().nanoseconds
-        if clock_ns != self._clock_ns:
-            self._clock_ns, self._clock_since_s = clock_ns, now_s
-
-    def close(self) -> None:
-        """Stop receiving."""
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
-
     def _listen_for_one_of(self, usable: list[str], now_s: float) -> str:
         """Listen for a type that comes; return why no message can be heard, or ''."""
         if len(usable) > 1:
@@ -362,24 +341,18 @@ class InputTopic(Generic[MessageT]):
             return ''
         last_s = max(self.last_received_s or 0.0, self._resumed_s)
         chosen = self._types.best_of(usable, last_s, now_s)
-        missing = ''
-        if chosen != self._types.chosen:
-            # A topic has one type at a time, and the executor lets go of the old one after this.
-            if self._subscription is None:
-                missing = self._subscribe_if_installed(chosen)
-            else:
-                self.close()
         if len(usable) > 1:
             others = ', '.join(name for name in usable if name != chosen)
             self._several_types = of_types(self.topic, chosen, others)
-        return missing
-
-    def _subscribe_if_installed(self, type_name: str) -> str:
-        """Subscribe to what was found on the topic; return which package that would need."""
-        try:
-            self._subscribe(type_name)
-        except ParameterError as error:
-            return fault('missing_package', topic=self.topic, error=error)
+        if chosen != self._types.chosen and self._subscription is None:
+            try:
+                self._subscribe(chosen)
+            except ParameterError as error:
+                return fault('missing_package', topic=self.topic, error=error)
+        elif chosen != self._types.chosen:
+            # A topic has one type at a time, and the executor lets go of the old one after this.
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
         return ''
 
     def _subscribe(self, type_name: str) -> None:
@@ -409,10 +382,7 @@ class InputTopic(Generic[MessageT]):
     def read_until(self, received_ns: int) -> None:
         """Read what waits, up to what DDS has received at a time, nanoseconds."""
         for _ in range(self._qos.depth):
-            if self._received_ns >= received_ns:
-                return
-            taken = self._take()
-            if taken is None:
+            if self._received_ns >= received_ns or (taken := self._take()) is None:
                 return
             self._receive(*taken)
 
@@ -421,7 +391,13 @@ class InputTopic(Generic[MessageT]):
         return None if self._subscription is None else take(self._subscription)
 
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
-        messages = self._newest(raw, info) if self._is_shedding else self._decode(raw, info)
+        messages = self._decode(raw, info)
+        if self._is_shedding:  # those behind it, too, and then those to be used
+            for _ in range(self._qos.depth):
+                if (taken := self._take()) is None:
+                    break
+                messages += self._decode(*taken)
+            messages = self.shedding.newest(messages, time.time_ns(), time.monotonic())
         for count, waiting in enumerate(messages, start=1):
             self.has_more = len(messages) > 1
             if waiting.received_ns:
@@ -430,23 +406,13 @@ class InputTopic(Generic[MessageT]):
             self.has_more = count < len(messages)
             self._on_message(waiting.message, waiting.receive_ns)
 
-    def _newest(self, raw: bytes, info: Mapping[str, int]) -> list[Waiting]:
-        """Decode a message and those behind it; return those to be used."""
-        waiting = self._decode(raw, info)
-        for _ in range(self._qos.depth):
-            taken = self._take()
-            if taken is None:
-                break
-            waiting += self._decode(*taken)
-        return self.shedding.newest(waiting, time.time_ns(), time.monotonic())
-
     def _decode(self, raw: bytes, info: Mapping[str, int]) -> list[Waiting]:
         """Return a message, decoded, in a list; none if it can't be."""
         self._received_ns = info['received_timestamp']
         receive_ns = self._reception_ns(self._received_ns)
         self.received += 1
         self.last_received_s = time.monotonic()
-        self._types.note_message()
+        self._types.have_come.add(self._types.chosen)
         try:
             message = self._decoders[self._types.chosen](raw, receive_ns)
         except MessageError as error:

@@ -6,7 +6,6 @@ First what a message passes, in one screen: from topics through the estimator to
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import numpy as np
 from rclpy.clock import JumpThreshold
@@ -172,7 +171,7 @@ def _start(timer: Timer) -> None:
         timer.reset()
 
 
-def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic[Any]]) -> None:
+def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic]) -> None:
     """Refuse the node's own estimate as an input: it would follow that for ever."""
     outputs = {node.resolve_topic_name(name): name for name in TOPICS}
     for source in inputs:

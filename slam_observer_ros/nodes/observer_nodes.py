@@ -105,13 +105,15 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
         forward_logging(self.get_logger())
         declare_settings(self, Settings, ObserverNodeSettings, ManagedNodeSettings)
         self._refuse_impossible_transitions()
-        if read_settings(self, ManagedNodeSettings).autostart_node:
-            self._start_by_itself()
-        else:
+        if not read_settings(self, ManagedNodeSettings).autostart_node:
             self.get_logger().info(
                 'not configured: waiting for its transitions, by a lifecycle manager or '
                 'ros2 lifecycle set'
             )
+            return
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                raise ParameterError('autostart_node: the reason is logged above')
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Create all parts."""
@@ -149,12 +151,6 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
             self._close()
         finally:
             super().destroy_node()
-
-    def _start_by_itself(self) -> None:
-        """Become active; raise a ParameterError if that fails, so that the process ends."""
-        for transition in (self.trigger_configure, self.trigger_activate):
-            if transition() != TransitionCallbackReturn.SUCCESS:
-                raise ParameterError('autostart_node: the reason is logged above')
 
     def _refuse_impossible_transitions(self) -> None:
         """Answer no to what the state does not allow; rclpy would end with a traceback."""

@@ -87,7 +87,14 @@ class SimulatorNode(RepeatableParameters):
         self._deliveries: Iterator[Delivery] = self._simulation.deliveries()
         self._next: Delivery | None = next(self._deliveries, None)
         self._publish_true_landmarks(self._start_ns)
-        self._publish_start()
+        # The pose, in the true world, of an estimate that starts at the identity
+        self._start_transform = TransformPublisher(self, '/tf_static', LATCHED_QOS)
+        self._start_transform.publish(
+            self._start_ns,
+            self._settings.truth_frame,
+            self._settings.map_frame,
+            self._simulation.pose(self._start_ns),
+        )
         self._give_up_s = time.monotonic()
         if self._publishes_clock:  # which can stand still until reliable readers have heard
             self._publish_until(self._start_ns)
@@ -110,7 +117,10 @@ class SimulatorNode(RepeatableParameters):
         elapsed_s = (time.monotonic() - self._start_wall_s) * self._settings.real_time_factor
         self._publish_until(self._start_ns + to_ns(elapsed_s))
         if self._next is None:
-            self._finish()
+            for publisher in (self._twist, self._landmarks, self._true_pose):
+                publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
+            self.get_logger().info('the run is over')
+            self.context.try_shutdown()
 
     def _publish_until(self, now_ns: int) -> None:
         if self._publishes_clock:
@@ -119,51 +129,25 @@ class SimulatorNode(RepeatableParameters):
             self._publish(self._next.event)
             self._next = next(self._deliveries, None)
 
-    def _finish(self) -> None:
-        for publisher in (self._twist, self._landmarks, self._true_pose):
-            publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
-        self.get_logger().info('the run is over')
-        self.context.try_shutdown()
-
     def _publish(self, event: SimulatedEvent) -> None:
         match event:
+            case VelocityEvent(stamp_ns, velocity) if self._settings.stamped:
+                frame = self._settings.base_frame
+                self._twist.publish(MESSAGES.twist_stamped(stamp_ns, frame, velocity))
             case VelocityEvent():
-                self._publish_velocity(event)
+                self._twist.publish(MESSAGES.twist(event.body_velocity))
             case ObservationEvent():
-                self._publish_observation(event)
-            case PoseTruth():
-                self._publish_true_pose(event)
-
-    def _publish_velocity(self, event: VelocityEvent) -> None:
-        stamp_ns, velocity = event.stamp_ns, event.body_velocity
-        if self._settings.stamped:
-            frame = self._settings.base_frame
-            self._twist.publish(MESSAGES.twist_stamped(stamp_ns, frame, velocity))
-        else:
-            self._twist.publish(MESSAGES.twist(velocity))
-
-    def _publish_observation(self, event: ObservationEvent) -> None:
-        contents = (event.stamp_ns, self._settings.base_frame, event.ids, event.points)
-        if self._settings.landmarks_type == 'PointCloud2':
-            self._landmarks.publish(MESSAGES.point_cloud2(*contents, velocities=event.velocities))
-        else:
-            self._landmarks.publish(encode_point_cloud(*contents))
-
-    def _publish_start(self) -> None:
-        """Publish the pose, in the true world, of an estimate that starts at the identity."""
-        self._start_transform = TransformPublisher(self, '/tf_static', LATCHED_QOS)
-        self._start_transform.publish(
-            self._start_ns,
-            self._settings.truth_frame,
-            self._settings.map_frame,
-            self._simulation.pose(self._start_ns),
-        )
-
-    def _publish_true_pose(self, truth: PoseTruth) -> None:
-        frame = self._settings.truth_frame
-        self._true_pose.publish(MESSAGES.pose_stamped(truth.stamp_ns, frame, truth.pose))
-        if self._scenario.landmark_speed > 0.0:
-            self._publish_true_landmarks(truth.stamp_ns)
+                contents = (event.stamp_ns, self._settings.base_frame, event.ids, event.points)
+                if self._settings.landmarks_type == 'PointCloud2':
+                    cloud = MESSAGES.point_cloud2(*contents, velocities=event.velocities)
+                    self._landmarks.publish(cloud)
+                else:
+                    self._landmarks.publish(encode_point_cloud(*contents))
+            case PoseTruth(stamp_ns, pose):
+                frame = self._settings.truth_frame
+                self._true_pose.publish(MESSAGES.pose_stamped(stamp_ns, frame, pose))
+                if self._scenario.landmark_speed > 0.0:
+                    self._publish_true_landmarks(stamp_ns)
 
     def _publish_true_landmarks(self, stamp_ns: int) -> None:
         truth = self._simulation.landmark_truth(stamp_ns)

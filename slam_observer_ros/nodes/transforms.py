@@ -76,8 +76,7 @@ class LiveTransforms:
         if self._dynamic is None:
             return
         for _ in range(TF_QOS.depth):
-            taken = take(self._dynamic)
-            if taken is None:
+            if (taken := take(self._dynamic)) is None:
                 return
             self._dynamic.callback(taken[0])
 
@@ -144,28 +143,24 @@ SENT = 10  # messages that may be on their way back at once
 class TransformPublisher:
     """Publishes single transforms on ``/tf``, or latched on ``/tf_static``.
 
-    Without tf2_msgs it logs so once and does nothing. ``sent`` are the last messages.
+    Without tf2_msgs it logs so once and does nothing: ``publisher`` is None. ``sent`` are the last
+    messages.
     """
 
     def __init__(self, node: Node, topic: str, qos: QoSProfile) -> None:
         self.sent: deque[bytes] = deque(maxlen=SENT)
-        self._publisher = None
+        self.publisher = None
         if TFMessage is None:
             node.get_logger().warning(f'tf2_msgs is not installed: nothing goes out on {topic}')
         else:
-            self._publisher = node.create_publisher(TFMessage, topic, qos)
-
-    @property
-    def can_publish(self) -> bool:
-        """Whether transforms go out."""
-        return self._publisher is not None
+            self.publisher = node.create_publisher(TFMessage, topic, qos)
 
     def publish(self, stamp_ns: int, parent: str, child: str, pose: FloatArray) -> None:
         """Publish the pose (4, 4) of frame ``child`` in frame ``parent``."""
-        if self._publisher is not None:
+        if self.publisher is not None:
             message = encode_transform(stamp_ns, parent, child, pose)
             self.sent.append(message)
-            self._publisher.publish(message)
+            self.publisher.publish(message)
 
 
 DISCOVERY_S = 2.0  # from the first pose on, before the base is taken to have no parent on /tf
@@ -299,11 +294,21 @@ class PoseBroadcaster:
         """Publish the newest pose that can be."""
         if not self._waiting:
             return
-        newest_ns = self.odometry_ns()
+        newest_ns, settings = self.odometry_ns(), self._settings
         self.problem = ''
-        self._find_parent(newest_ns)
-        self._report_delay(newest_ns)
-        if self._child == self._settings.odom_frame:
+        # Whose pose to publish: odometry's on /tf, however late it comes
+        if newest_ns is not None and self._child != settings.odom_frame:
+            self._choose_child(settings.odom_frame, '/tf has')
+        searched_s = time.monotonic() - (self._begin_s or 0.0)
+        if not self._child and searched_s > DISCOVERY_S and not self._other_parent():
+            self._choose_child(settings.base_frame, 'nobody publishes')
+        # Odometry may be far behind the poses, or have ended
+        known_ns = self._waiting[0][0] if newest_ns is None else newest_ns
+        behind_ns = self._waiting[-1][0] - known_ns
+        if self._child == settings.odom_frame and behind_ns > LATE_NS:
+            behind = f'{to_s(behind_ns):.1f} s behind the estimate'
+            self._report('odometry_behind', behind='without stamps' if newest_ns == 0 else behind)
+        if self._child == settings.odom_frame:
             self._publish_correction(newest_ns)
         elif self._child and not self._other_parent():
             stamp_ns, pose = self._waiting.pop()
@@ -328,14 +333,6 @@ class PoseBroadcaster:
             return None
         return self._transforms.newest_ns(settings.odom_frame, settings.base_frame)
 
-    def _find_parent(self, newest_ns: int | None) -> None:
-        """Choose whose pose to publish: odometry's on /tf, however late it comes."""
-        if newest_ns is not None and self._child != self._settings.odom_frame:
-            self._choose_child(self._settings.odom_frame, '/tf has')
-        searched_s = time.monotonic() - (self._begin_s or 0.0)
-        if not self._child and searched_s > DISCOVERY_S and not self._other_parent():
-            self._choose_child(self._settings.base_frame, 'nobody publishes')
-
     def _other_parent(self) -> str:
         """Return the base's parent on /tf if that forbids to publish its pose; else ''."""
         now_s, settings = time.monotonic(), self._settings
@@ -348,16 +345,6 @@ class PoseBroadcaster:
         if self._parent:
             self._report('other_parent', parent=self._parent)
         return self._parent
-
-    def _report_delay(self, newest_ns: int | None) -> None:
-        """Report odometry that is far behind the poses, or has ended."""
-        settings = self._settings
-        known_ns = self._waiting[0][0] if newest_ns is None else newest_ns
-        behind_ns = self._waiting[-1][0] - known_ns
-        if self._child != settings.odom_frame or behind_ns <= LATE_NS:
-            return
-        behind = f'{to_s(behind_ns):.1f} s behind the estimate'
-        self._report('odometry_behind', behind='without stamps' if newest_ns == 0 else behind)
 
     def _report(self, kind: str, **figures: object) -> None:
         settings = self._settings
@@ -391,7 +378,7 @@ class PoseBroadcaster:
     def _choose_child(self, child: str, reason: str) -> None:
         self._child = child
         settings = self._settings
-        if not self._publisher.can_publish:
+        if self._publisher.publisher is None:
             return
         self._node.get_logger().info(
             f"publishing '{settings.map_frame}' to '{child}' on /tf: "
@@ -404,9 +391,5 @@ class PoseBroadcaster:
             return
         self._last_ns = stamp_ns
         self._own_ns.append(stamp_ns)
-        if self._settings.invert_tf:
-            self._publisher.publish(
-                stamp_ns, self._child, self._settings.map_frame, se3.inverse(pose)
-            )
-        else:
-            self._publisher.publish(stamp_ns, self._settings.map_frame, self._child, pose)
+        seen_from = se3.inverse(pose) if self._settings.invert_tf else pose
+        self._publisher.publish(stamp_ns, *self._ends, seen_from)
