@@ -289,7 +289,12 @@ def _open_mcap(path: Path) -> tuple[MessageSource, str | None]:
     source = McapSource(path)
     encodings = source.other_encodings
     if any(topic.count for topic in source.topics) or not (source.loss or encodings):
-        return source, _left_out(path, source) or _other_encodings(path, source)
+        warning = _left_out(path, source)
+        if encodings and warning is None:
+            names = ', '.join(sorted(encodings))
+            count = encodings.total()
+            warning = f'{path}: {count} channels of other encodings are left out: {names}'
+        return source, warning
     if 'ros1' in encodings:
         raise RecordingError(
             f'{path}: its messages are of ROS 1, which are read of .bag files only; give the .bag '
@@ -312,15 +317,6 @@ def _left_out(path: Path, source: MessageSource) -> str | None:
     if loss:
         return f'{path}: its statistics count more messages than it holds: {loss}'
     return None
-
-
-def _other_encodings(path: Path, source: McapSource) -> str | None:
-    """Say which channels are no messages of ROS; None if all are."""
-    encodings = source.other_encodings
-    if not encodings:
-        return None
-    names = ', '.join(sorted(encodings))
-    return f'{path}: {encodings.total()} channels of other encodings are left out: {names}'
 
 
 FORMATS: dict[str, Callable[[Path], tuple[MessageSource, str | None]]] = {
@@ -370,7 +366,7 @@ class DecompressedSource(MessageSource):
 def decompressed(source: MessageSource) -> MessageSource:
     """Return a source of messages that are not compressed."""
     first = islice(source.messages(source.topics), _SHOWN)
-    is_compressed = any(_is_compressed(bytes(raw.data[: len(_MAGIC)])) for raw in first)
+    is_compressed = any(bytes(raw.data[: len(_MAGIC)]) == _MAGIC for raw in first)
     return DecompressedSource(source) if is_compressed else source
 
 
@@ -388,14 +384,10 @@ def decompressed_file(path: Path) -> tuple[Path, TemporaryDirectory[str]]:
     return copy, directory
 
 
-def _is_compressed(data: bytes) -> bool:
-    return data.startswith(_MAGIC)
-
-
 def _decompressed(data: bytes) -> bytes:
     import zstandard
 
-    if not _is_compressed(data):
+    if not data.startswith(_MAGIC):
         return data
     try:
         return zstandard.ZstdDecompressor().decompressobj().decompress(data)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 import logging
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -35,7 +34,6 @@ from slam_observer_ros.recordings.event_builder import (
     drop_reason,
     DropError,
     EventBuilder,
-    Measured,
     with_receive_time,
 )
 from slam_observer_ros.recordings.frames import BaseFrame, insert_transforms, TransformBuffer
@@ -114,12 +112,7 @@ class Recording:
     def __enter__(self) -> Recording:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -217,8 +210,12 @@ class Recording:
         # What waited for a transform, then what has just come
         events = reading.builder.retry(raw.receive_stamp_ns)
         if raw.topic in reading.decoders:
+            receive_ns = 0 if raw.topic in reading.simulated else raw.receive_stamp_ns
             for measured in self._decoded(raw, reading.decoders[raw.topic]) or ():
-                timed = self._timed(measured, raw, raw.topic in reading.simulated)
+                timed = with_receive_time(measured, receive_ns)
+                if timed is not measured:
+                    self.unstamped[raw.topic.name] += 1
+                self.arrivals[raw.topic.name].add(raw.receive_stamp_ns, timed.stamp_ns)
                 events += reading.builder.add(timed, raw.receive_stamp_ns)
         for event in events:
             yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
@@ -302,10 +299,12 @@ class Recording:
 
     def _true_poses(self, topic: Topic | None) -> Iterator[PoseBlock]:
         for raw in self._source.blocks((topic,), topic) if topic else ():
-            block = _pose_block(raw) if isinstance(raw, RawBlock) else None
-            if block is not None:
-                yield block
-                continue
+            if isinstance(raw, RawBlock):
+                try:
+                    yield decode_pose_block(raw)
+                    continue
+                except MessageError:  # one of them needs a look for itself
+                    pass
             for message in raw.messages():
                 pose = self._decoded(message, decode_pose)
                 if pose is not None:
@@ -335,14 +334,6 @@ class Recording:
                 logger.warning('%s', found('malformed_message', topic=topic, error=error))
             self.malformed[raw.topic.name] += 1
             return None
-
-    def _timed(self, measured: Measured, raw: RawMessage, is_simulated: bool) -> Measured:
-        receive_stamp_ns = 0 if is_simulated else raw.receive_stamp_ns
-        timed = with_receive_time(measured, receive_stamp_ns)
-        if timed is not measured:
-            self.unstamped[raw.topic.name] += 1
-        self.arrivals[raw.topic.name].add(raw.receive_stamp_ns, timed.stamp_ns)
-        return timed
 
     def _all_decoded(
         self, topic: Topic | None, decode: Callable[[RawMessage], _Decoded]
@@ -375,11 +366,3 @@ def _velocities_of(raw: RawBlock, reading: _Reading) -> VelocityBlock | None:
     return (
         velocities if has_stamps and reading.builder.passes_on(velocities.sensor_frame) else None
     )
-
-
-def _pose_block(raw: RawBlock) -> PoseBlock | None:
-    """Return the poses of messages; None if one of them needs a look for itself."""
-    try:
-        return decode_pose_block(raw)
-    except MessageError:
-        return None

@@ -117,7 +117,11 @@ def select_topics(
     """
     used = [topic for topic in topics if topic.count > 0]
     choice = _Choice(topics, used, inputs.map_frame, has_ids, pose_frame)
-    velocity = choice.require(_of_velocities(inputs.velocity_source), names.velocity)
+    wanted = ('velocity', '--velocity-topic', tuple(message_types('velocity')))
+    if inputs.velocity_source == POSE_DIFFERENCES:
+        wanted = ('odometry', '--velocity-topic', (ODOMETRY,))
+    velocity = choice.require(_Role(*wanted, False, _velocity_rank), names.velocity)
+    imu = _Role('Imu', '--imu', tuple(message_types('angular velocity')), False, lambda _: 0)
     landmarks = choice.require(*_of_landmarks(names.landmarks, inputs.landmarks_type))
     selected = SelectedTopics(
         velocity,
@@ -125,13 +129,20 @@ def select_topics(
         choice.pick(_of_true_poses(), names.pose_truth),
         choice.pick(_LANDMARK_TRUTH, names.landmark_truth),
         transform_topics(topics, (velocity, landmarks)),
-        choice.require(_of_imus(), names.imu) if inputs.use_imu else None,
+        choice.require(imu, names.imu) if inputs.use_imu else None,
         tuple(topic for topic in used if topic.message_type == CAMERA_INFO)
         if landmarks.message_type in IN_IMAGES
         else (),
     )
-    if selected.pose_truth is None:
-        _warn_of_unread_truth(used)
+    poses = message_types('pose')
+    unread = [
+        topic
+        for topic in used
+        if _is_truth(topic.name) and topic.message_type not in (*poses, *CLOUDS)
+    ]
+    if unread and selected.pose_truth is None:
+        finding = found('unread_truth', types=_join(poses), topics=_join(unread))
+        logger.warning('%s', finding)
     return selected
 
 
@@ -167,7 +178,11 @@ class _Choice:
         right = [topic for topic in self.used if _is_truth(topic.name) == role.is_truth]
         fitting = [topic for topic in right if self._fits(topic, role)]
         if len(fitting) > 1 and not role.is_truth:
-            fitting = [topic for topic in fitting if not self._is_estimate(topic)] or fitting
+            fitting = [
+                topic
+                for topic in fitting
+                if topic.message_type != ODOMETRY or self.pose_frame(topic) != self.map_frame
+            ] or fitting
         found = _best(fitting, role)
         if found is None and role.is_typed:
             return _best([t for t in right if t.message_type in role.message_types], role)
@@ -179,9 +194,6 @@ class _Choice:
         if topic.message_type not in role.message_types:
             return False
         return topic.message_type not in CLOUDS or self.has_ids(topic)
-
-    def _is_estimate(self, topic: Topic) -> bool:
-        return topic.message_type == ODOMETRY and self.pose_frame(topic) == self.map_frame
 
 
 def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> TransformTopics:
@@ -199,7 +211,7 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
         and last_part(topic.name) in ('tf', 'tf_static')
     ]
     shared = commonpath([_namespace(topic) for topic in inputs])
-    fitting = [tree for tree in trees if _encloses(_namespace(tree), shared)]
+    fitting = [t for t in trees if commonpath([_namespace(t), shared]) == _namespace(t)]
     if not fitting and len({_namespace(tree) for tree in trees}) == 1:
         fitting = trees
     if trees and not fitting:
@@ -212,25 +224,8 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
     return TransformTopics(chosen.get('tf_static', ()), chosen.get('tf', ()))
 
 
-def _encloses(outer: str, inner: str) -> bool:
-    return commonpath([outer, inner]) == outer
-
-
 def _namespace(topic: Topic) -> str:
     return '/' + topic.name.strip('/').rpartition('/')[0]
-
-
-def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:
-    """Say why what looks like true poses is passed over."""
-    poses = message_types('pose')
-    unread = [
-        topic
-        for topic in topics
-        if _is_truth(topic.name) and topic.message_type not in (*poses, *CLOUDS)
-    ]
-    if unread:
-        finding = found('unread_truth', types=_join(poses), topics=_join(unread))
-        logger.warning('%s', finding)
 
 
 def _velocity_rank(name: str) -> int:
@@ -245,17 +240,6 @@ def _landmark_rank(name: str) -> int:
     if last_part(name) == 'landmarks':
         return 0
     return 2 if last_part(name) in ESTIMATE_NAMES else 1
-
-
-def _pose_rank(name: str) -> int:
-    return 0 if last_part(name) == 'pose' else 1
-
-
-def _of_velocities(source: str) -> _Role:
-    if source == POSE_DIFFERENCES:
-        return _Role('odometry', '--velocity-topic', (ODOMETRY,), False, _velocity_rank)
-    types = tuple(message_types('velocity'))
-    return _Role('velocity', '--velocity-topic', types, False, _velocity_rank)
 
 
 def _of_landmarks(name: str | None, landmarks_type: str) -> tuple[_Role, str | None]:
@@ -274,14 +258,13 @@ def _of_landmarks(name: str | None, landmarks_type: str) -> tuple[_Role, str | N
 
 
 def _of_true_poses() -> _Role:
-    return _Role('true pose', '--pose-truth-topic', tuple(message_types('pose')), True, _pose_rank)
+    types = tuple(message_types('pose'))
+    return _Role(
+        'true pose', '--pose-truth-topic', types, True, lambda name: last_part(name) != 'pose'
+    )
 
 
 _LANDMARK_TRUTH = _Role('true landmark', '--landmark-truth-topic', CLOUDS, True, _landmark_rank)
-
-
-def _of_imus() -> _Role:
-    return _Role('Imu', '--imu', tuple(message_types('angular velocity')), False, lambda _name: 0)
 
 
 def _is_truth(name: str) -> bool:

@@ -16,6 +16,7 @@ from numpy.testing import assert_array_equal
 import ros_messages as ros
 from strategies import generators
 
+from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.events import VelocityBlock
 from slam_observer_ros.recordings import reader
 from slam_observer_ros.recordings.mcap_source import McapSource
@@ -207,7 +208,7 @@ def test_true_poses_in_blocks_are_those_one_by_one(rng, message_type, oddities):
         path = Path(directory) / 'run.mcap'
         write_mcap(path, recorded_truth(rng, message_type, oddities), chunk_size=5000)
         truth, malformed = read_truth(path)
-        with patch.object(reader, '_pose_block', lambda _raw: None):
+        with patch.object(reader, 'decode_pose_block', side_effect=MessageError):
             expected, expected_malformed = read_truth(path)
     assert malformed == expected_malformed
     assert len(truth.poses) > 0
