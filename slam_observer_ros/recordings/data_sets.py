@@ -66,7 +66,14 @@ def load_mrclam(folder: Path | str, robot: int, measure: str = 'point') -> DataS
     those there are. Files of the truth may be missing.
     """
     folder = Path(folder)
-    _require_robot(folder, robot)
+    if not folder.is_dir():
+        raise DataSetError(f'{folder}: no such directory; give one such as MRCLAM_Dataset6')
+    names = [re.fullmatch(r'Robot(\d+)_Odometry\.dat', path.name) for path in folder.iterdir()]
+    robots = sorted(int(name.group(1)) for name in names if name)
+    if not robots:
+        raise DataSetError(f'{folder}: not an MRCLAM data set: no RobotN_Odometry.dat in it')
+    if robot not in robots:
+        raise DataSetError(f'{folder}: no robot {robot}; there are {", ".join(map(str, robots))}')
     odometry = _table(folder / f'Robot{robot}_Odometry.dat', columns=3)
     truth = _truth(folder / f'Robot{robot}_Groundtruth.dat', columns=4)
     landmarks = _truth(folder / 'Landmark_Groundtruth.dat', columns=5)
@@ -93,17 +100,6 @@ def _measured(event: ObservationEvent, kind: int | None) -> ObservationEvent:
     ranges = np.linalg.norm(event.points, axis=1)[:, None]
     points = ranges * [1.0, 0.0, 0.0] if kind == RANGE else event.points / ranges
     return replace(event, points=points, kinds=np.full(len(points), kind))
-
-
-def _require_robot(folder: Path, robot: int) -> None:
-    if not folder.is_dir():
-        raise DataSetError(f'{folder}: no such directory; give one such as MRCLAM_Dataset6')
-    names = [re.fullmatch(r'Robot(\d+)_Odometry\.dat', path.name) for path in folder.iterdir()]
-    robots = sorted(int(name.group(1)) for name in names if name)
-    if not robots:
-        raise DataSetError(f'{folder}: not an MRCLAM data set: no RobotN_Odometry.dat in it')
-    if robot not in robots:
-        raise DataSetError(f'{folder}: no robot {robot}; there are {", ".join(map(str, robots))}')
 
 
 def _truth(path: Path, columns: int, delimiter: str | None = None) -> FloatArray:
@@ -161,12 +157,8 @@ def _observations(folder: Path, robot: int) -> tuple[list[ObservationEvent], Cou
     )
     misread = subjects == _UNKNOWN_SUBJECT
     is_landmark = subjects >= FIRST_LANDMARK_SUBJECT
-    left_out = Counter(
-        {
-            ROBOT_SIGHTING: int(np.sum(~is_landmark & ~misread)),
-            MISREAD: int(np.sum(misread)),
-        }
-    )
+    seen_robots = int(np.sum(~is_landmark & ~misread))
+    left_out = Counter({ROBOT_SIGHTING: seen_robots, MISREAD: int(np.sum(misread))})
 
     # The rows of each stamp are one observation
     measurements, subjects = measurements[is_landmark], subjects[is_landmark]
@@ -334,18 +326,13 @@ def _variables(file: Path) -> dict[str, FloatArray]:
         expected = tuple(images if size == -1 else size for size in shape)
         if variables[name].shape != expected:
             raise DataSetError(f'{file}: {name} has shape {variables[name].shape}, not {expected}')
-        if not _are_plausible(variables[name]):
+        # Real numbers, none of them NaN or larger than any of the file
+        is_real = variables[name].dtype.kind in 'fiu'
+        if not (is_real and (np.abs(variables[name].astype(np.float64)) <= _MAX_SIZE).all()):
             raise DataSetError(
                 f'{file}: damaged: {name} has no numbers, or some beyond {_MAX_SIZE:g}'
             )
     return {name: variables[name].astype(np.float64) for name in _SHAPES}
-
-
-def _are_plausible(values: FloatArray) -> bool:
-    """Return whether they are real numbers, none of them NaN or larger than any of the file."""
-    return values.dtype.kind in 'fiu' and bool(
-        (np.abs(values.astype(np.float64)) <= _MAX_SIZE).all()
-    )
 
 
 def _sightings(stamps_ns: IntArray, variables: dict[str, FloatArray]) -> list[ObservationEvent]:

@@ -59,7 +59,8 @@ def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topi
     velocity, landmarks = selected.velocity, selected.landmarks
     decoded: dict[Topic, Decode] = {landmarks: _landmarks}
     if landmarks.message_type == TRANSFORMS:
-        decoded[landmarks] = partial(_tags_on_tf, inputs.tag_frame_prefix)
+        prefix = inputs.tag_frame_prefix
+        decoded[landmarks] = lambda raw: observed_tags(decode_transforms(raw.data), prefix)
     else:
         landmark_decoder(landmarks.message_type, landmarks.definition)  # raises, if none does
     if inputs.velocity_source == POSE_DIFFERENCES:
@@ -118,14 +119,9 @@ def _one(decode: DecodeOne[Measured]) -> Decode:
 
 def _landmarks(raw: RawMessage) -> list[ObservationEvent]:
     event = decode_landmarks(raw)
-    problem = scan_problem(event)
-    if problem:
+    if problem := scan_problem(event):
         raise RecordingError(f'{raw.topic}: {problem}')
     return [event]
-
-
-def _tags_on_tf(tag_frame_prefix: str, raw: RawMessage) -> list[ObservationEvent]:
-    return observed_tags(decode_transforms(raw.data), tag_frame_prefix)
 
 
 @cache

@@ -84,10 +84,17 @@ class PoseDifferences:
             self._begin(stamp_ns, pose, before=last)
             return None
         self._refuse_stamp(stamp_ns, duration_ns)
-        motion = se3.log(se3.inverse(last[1]) @ pose)
+        motion, duration_s = se3.log(se3.inverse(last[1]) @ pose), to_s(duration_ns)
         self._used = stamp_ns, pose
-        _check_plausible(motion, to_s(duration_ns))
-        return VelocityEvent(last[0], motion / to_s(duration_ns), is_mean=True)
+        turn, way = np.linalg.norm(motion.reshape(2, 3), axis=1).tolist()
+        if max(turn, way) > max(MAX_SPEED * duration_s, MIN_JUMP):
+            raise InvalidEventError(
+                POSE_JUMP,
+                f"the odometry's pose has jumped, by {way:.2f} m and {turn:.2f} rad in "
+                f'{duration_s:.3f} s: it was reset, and how the robot moved meanwhile is not '
+                'known',
+            )
+        return VelocityEvent(last[0], motion / duration_s, is_mean=True)
 
     def _last_before(self, stamp_ns: int) -> tuple[int, FloatArray] | None:
         """Return the last pose used; the one before a pause if the stamp after it was wrong."""
@@ -125,16 +132,6 @@ class PoseDifferences:
             SKIPPED,
             f'its stamp is {to_s(duration_ns):.4f} s after that of the last pose used, where '
             f'{to_s(round(usual_ns)):.4f} s are usual: how it moved counts with the next one',
-        )
-
-
-def _check_plausible(motion: FloatArray, duration_s: float) -> None:
-    turn, way = np.linalg.norm(motion.reshape(2, 3), axis=1).tolist()
-    if max(turn, way) > max(MAX_SPEED * duration_s, MIN_JUMP):
-        raise InvalidEventError(
-            POSE_JUMP,
-            f"the odometry's pose has jumped, by {way:.2f} m and {turn:.2f} rad in "
-            f'{duration_s:.3f} s: it was reset, and how the robot moved meanwhile is not known',
         )
 
 
@@ -329,7 +326,11 @@ class EventBuilder:
         any clock that goes on steadily.
         """
         if isinstance(measured, PoseMessage):
-            velocity = self._difference(measured)
+            try:
+                velocity = self._poses.add(measured.stamp_ns, measured.pose)
+            except InvalidEventError as error:
+                self._on_drop(error)
+                return []
             if velocity is None:
                 return []
             measured = replace(velocity, sensor_frame=measured.child_frame_id)
@@ -340,22 +341,18 @@ class EventBuilder:
         is_decided = frame_id not in self._taken_as_base
         return is_decided and not self._waiting and self._base_frame.is_base(frame_id)
 
-    def retry(self, now_ns: int) -> list[Event]:
-        """Return the events of what has waited long enough, or for what is known by now."""
-        waiting, self._waiting = self._waiting, deque()
-        return [
-            event
-            for measured, deadline_ns, _ in waiting
-            for event in self._attempt(measured, deadline_ns, now_ns)
-        ]
+    def retry(self, now_ns: int | None) -> list[Event]:
+        """Return the events of what has waited long enough, or for what is known by now.
 
-    def finish(self) -> list[Event]:
-        """Return the events of what still waits, when nothing more will come."""
+        None is the time at which nothing more will come: all has waited long enough.
+        """
         waiting, self._waiting = self._waiting, deque()
         return [
             event
             for measured, deadline_ns, _ in waiting
-            for event in self._attempt(measured, deadline_ns, deadline_ns)
+            for event in self._attempt(
+                measured, deadline_ns, deadline_ns if now_ns is None else now_ns
+            )
         ]
 
     def clear(self) -> None:
@@ -363,28 +360,18 @@ class EventBuilder:
         self._waiting.clear()
         self._poses.clear()
 
-    def _difference(self, message: PoseMessage) -> VelocityEvent | None:
-        try:
-            return self._poses.add(message.stamp_ns, message.pose)
-        except InvalidEventError as error:
-            self._on_drop(error)
-            return None
-
     def _attempt(self, measured: Event, deadline_ns: int, now_ns: int) -> list[Event]:
         try:
             return [self._event(measured, now_ns)]
         except TransformError as error:
-            if now_ns < deadline_ns:
-                self._wait(measured, deadline_ns, error)
-                return []
-            return self._give_up(measured, deadline_ns, error)
-
-    def _wait(self, measured: Event, deadline_ns: int, error: TransformError) -> None:
-        if len(self._waiting) == MAX_WAITING:
-            *_, reason = self._waiting.popleft()
-            text = f'more than {MAX_WAITING} measurements wait for their transforms: {reason}'
-            self._on_drop(TransformError(text))
-        self._waiting.append((measured, deadline_ns, error))
+            if now_ns >= deadline_ns:
+                return self._give_up(measured, deadline_ns, error)
+            if len(self._waiting) == MAX_WAITING:
+                *_, reason = self._waiting.popleft()
+                text = f'more than {MAX_WAITING} measurements wait for their transforms: {reason}'
+                self._on_drop(TransformError(text))
+            self._waiting.append((measured, deadline_ns, error))
+            return []
 
     def _event(self, measured: Event, now_ns: int) -> Event:
         if isinstance(measured, ObservationEvent):

@@ -252,7 +252,8 @@ class BaseFrame:
         are where /tf has them in the camera's frame; what only an image shows is a direction.
         """
         frame_id = self._sensor_frame or event.sensor_frame
-        if event.families is not None and not self._is_without_poses(event):
+        has_poses = event.sensor_frame.lstrip('/') not in self._without_poses
+        if event.families is not None and (has_poses or self._is_any_on_tf(event)):
             event = self._placed_tags(event, event.families, frame_id)
         elif event.pixels is not None:
             event = self._seen_directions(event)
@@ -299,11 +300,8 @@ class BaseFrame:
         not known to the detector then.
         """
         camera = event.sensor_frame.lstrip('/')
-        if event.families is None or event.pixels is None:
-            return False
-        if camera not in self._transforms.cameras:
-            return False
-        if self._is_any_on_tf(event):
+        has_pixels = event.families is not None and event.pixels is not None
+        if not has_pixels or camera not in self._transforms.cameras or self._is_any_on_tf(event):
             return False
         if camera not in self._without_poses:
             self._without_poses.add(camera)
@@ -316,10 +314,6 @@ class BaseFrame:
     def expect_no_poses(self) -> None:
         """Take fiducials of all known cameras for directions: their poses will not come."""
         self._without_poses |= set(self._transforms.cameras)
-
-    def _is_without_poses(self, event: ObservationEvent) -> bool:
-        camera = event.sensor_frame.lstrip('/')
-        return camera in self._without_poses and not self._is_any_on_tf(event)
 
     def _is_any_on_tf(self, event: ObservationEvent) -> bool:
         """Return whether /tf has, or had, the frame of one of the fiducials."""

@@ -202,7 +202,7 @@ class Recording:
                 continue
             for message in raw.messages():
                 yield from self._events_of(message, reading)
-        yield from builder.finish()
+        yield from builder.retry(None)
 
     def _events_of(self, raw: RawMessage, reading: _Reading) -> Iterator[Event]:
         if raw.topic in reading.moving:

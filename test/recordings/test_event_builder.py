@@ -134,7 +134,7 @@ def test_what_too_many_wait_behind_is_dropped_and_reported():
     assert "'camera' and 'base_link' are not connected" in str(drops[0])
     for frame in ('camera', 'lidar'):
         transforms.insert('base_link', frame, 0, WHEEL, is_static=True)
-    events = builder.finish()
+    events = builder.retry(None)
     assert [event.stamp_ns for event in events] == [k * MS for k in range(3, MAX_WAITING + 3)]
     assert len(drops) == 3
 
