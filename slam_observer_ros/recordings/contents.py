@@ -13,7 +13,8 @@ import numpy as np
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.events import AngularVelocityEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import CLOUDS, ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import APRILTAGS, no_tags, observed_tags, POSE_ARRAY
 from slam_observer_ros.messages.poses import decode_odometry, ODOMETRY, TRANSFORMS
@@ -33,6 +34,15 @@ MAX_EMPTY_CLOUDS = 1000
 
 MAX_COMPARED = 5000
 """Most messages of an odometry whose twist is compared with its pose."""
+
+MAX_CHANGES = 10
+"""Changes of the frame of velocities up to which a driver may have been started again."""
+
+MAX_BACK = 0.1
+"""Share of the stamps that may be before the last one's."""
+
+FEWEST_COMPARED = 100
+"""Messages without which nothing is said of who published them."""
 
 _Decoded = TypeVar('_Decoded')
 
@@ -124,6 +134,37 @@ class Contents:
                     break
         return check.problem
 
+    def signs_of_rivals(self, topic: Topic, decode: Decode) -> str:
+        """Return what shows that two publish velocities on one topic; empty if nothing does.
+
+        A recording does not say who published. But what one publishes is of one frame, and its
+        stamps increase; nor is every second message its own, in velocity and in time.
+        """
+        first = islice(self._decoded((topic,), decode), MAX_COMPARED)
+        measured = [
+            (each.stamp_ns, _speeds(each), each.sensor_frame)
+            for events in first
+            for each in events
+            if isinstance(each, VelocityEvent | AngularVelocityEvent)
+        ]
+        if len(measured) < FEWEST_COMPARED:
+            return ''
+        frames = [frame for *_, frame in measured]
+        if sum(frame != after for frame, after in pairwise(frames)) > MAX_CHANGES:
+            return f'of the frames {", ".join(sorted(set(frames)))}'
+        stamps_ns = np.array([stamp_ns for stamp_ns, *_ in measured])
+        if np.mean(np.diff(stamps_ns) < 0) > MAX_BACK:
+            return 'their stamps go back and forth'
+        # In a simulation both have the same stamp, and come in any order.
+        speeds = np.array([each for _, each, _ in measured])
+        order = np.lexsort((np.linalg.norm(speeds, axis=1), stamps_ns))
+        V, steps_ns = speeds[order], np.diff(stamps_ns[order])
+        next_V, second_V = (float(((V[k:] - V[:-k]) ** 2).sum()) for k in (1, 2))
+        next_ns, second_ns = (np.median(np.abs(steps_ns[k:] - steps_ns[:-k])) for k in (1, 2))
+        if second_V < next_V / 2.0 and second_ns < next_ns / 2.0:
+            return 'every second message is of another velocity than those between'
+        return ''
+
     def begins_at_zero(self, topic: Topic, decode: Decode) -> bool:
         """Return whether the stamps are of a simulated clock, which begins at zero."""
         has_begun = False
@@ -159,6 +200,12 @@ class Contents:
         for raw in self._source.messages(topics):
             with suppress(MessageError):
                 yield decode(raw)
+
+
+def _speeds(measured: VelocityEvent | AngularVelocityEvent) -> FloatArray:
+    if isinstance(measured, VelocityEvent):
+        return measured.body_velocity
+    return measured.angular_velocity
 
 
 MOST_SAMPLES = 8192

@@ -5,11 +5,11 @@ And by which part of a drive they are judged.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, groupby
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,12 +22,14 @@ from slam_observer_ros.events import (
     ObservationEvent,
     POINT,
     UNKNOWN_ID,
+    VelocityBlock,
     VelocityEvent,
 )
 from slam_observer_ros.lie import so3
 from slam_observer_ros.models.observation_noise import ObservationNoise
 
 _IDENTITY = np.eye(3)
+EventT = TypeVar('EventT', bound=Event | VelocityBlock)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +59,8 @@ class Correction:
         )
 
     def apply(
-        self, events: Iterable[Event], noise: ObservationNoise | None = None
-    ) -> Iterable[Event]:
+        self, events: Iterable[EventT], noise: ObservationNoise | None = None
+    ) -> Iterable[EventT]:
         """Yield the events as they should have been recorded.
 
         With ``noise`` points keep theirs, as a share of their distance: else a world that shrinks
@@ -79,6 +81,8 @@ class Correction:
                 )
             elif isinstance(event, VelocityEvent):
                 yield replace(event, body_velocity=scales * event.body_velocity)
+            elif isinstance(event, VelocityBlock):
+                yield replace(event, body_velocities=scales * event.body_velocities)
             else:
                 yield replace(event, angular_velocity=self.turn * event.angular_velocity)
 
@@ -240,6 +244,31 @@ def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
         if isinstance(event, VelocityEvent):
             drive.add(event)
     return kept
+
+
+def in_blocks(events: Iterable[Event]) -> Iterator[Event | VelocityBlock]:
+    """Yield events with the velocities that follow each other in blocks, which take less time."""
+    for alike, group in groupby(events, key=_of_a_block):
+        if alike is None:
+            yield from group
+            continue
+        velocities = [each for each in group if isinstance(each, VelocityEvent)]
+        covariances = [each.covariance for each in velocities if each.covariance is not None]
+        received = [each.receive_ns for each in velocities if each.receive_ns is not None]
+        yield VelocityBlock(
+            np.array([each.stamp_ns for each in velocities]),
+            np.array([each.body_velocity for each in velocities]),
+            np.array(covariances) if covariances else None,
+            np.array(received) if received else None,
+            is_mean=velocities[0].is_mean,
+        )
+
+
+def _of_a_block(event: Event) -> tuple[bool, bool, bool] | None:
+    """Return what velocities of a block have in common; None for what is no velocity."""
+    if not isinstance(event, VelocityEvent):
+        return None
+    return event.is_mean, event.covariance is None, event.receive_ns is None
 
 
 def driven_s(events: Iterable[Event]) -> float:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.estimates import Reason
 from slam_observer_ros.recordings.contents import Arrivals
+from slam_observer_ros.recordings.decoding import input_decoders
 from slam_observer_ros.recordings.event_builder import NO_TRANSFORM
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import SelectedTopics
@@ -110,8 +111,21 @@ def of_recording(
     if recording.loss and not recording.warning:
         yield found('damaged', path=recording.path, loss=recording.loss)
     yield from of_stamps(recording.unstamped)
+    yield from of_publishers(recording, selected, inputs)
     if inputs.velocity_source != POSE_DIFFERENCES:
         yield from _of_poses(recording, selected, result)
+
+
+def of_publishers(
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings
+) -> Iterator[Finding]:
+    """Say on which of the topics of velocities more than one publishes, by what is on them."""
+    decoders = input_decoders(selected, replace(inputs, velocity_source='twist'))
+    for topic in (selected.velocity, selected.imu):
+        if topic is not None:
+            signs = recording.contents.signs_of_rivals(topic, decoders[topic])
+            if signs:
+                yield found('several_publishers', count=2, names=signs, topic=topic.name)
 
 
 def _of_poses(recording: Recording, selected: SelectedTopics, result: Replay) -> Iterator[Finding]:

@@ -23,12 +23,13 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     Event,
     ObservationEvent,
+    VelocityBlock,
 )
 from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.models.observation_noise import ObservationNoise
-from slam_observer_ros.runs.accuracy import LikelihoodRecorder
+from slam_observer_ros.runs.accuracy import Likelihood, LikelihoodRecorder
 from slam_observer_ros.runs.corrections import (
     ALIKE,
     AS_IT_IS,
@@ -36,6 +37,7 @@ from slam_observer_ros.runs.corrections import (
     Correction,
     CORRECTIONS,
     first_drive,
+    in_blocks,
     IN_DEGREES,
     MIRRORED,
     never_turns,
@@ -154,14 +156,19 @@ def _best(
     That is ``before`` where none does, the score of what was recorded.
     """
     early, tried = first_drive(events, EARLY), []
+    at_first = before.until(early[-1].stamp_ns)
     is_in_degrees = turned(events) * IN_DEGREES > LEAST_TURN_RAD
     for each in corrections:
         if each.kind != 'turning_in_degrees' or is_in_degrees:
-            tried.append((yield from _score(settings, early, each, known)))
+            score = yield from _score(settings, early, each, known)
+            if not at_first.is_clearly_better(score):
+                tried.append(score)
     tried.sort(key=lambda score: score.mean)
     best = before
-    as_sized = yield from _score(settings, events, AS_SIZED, known)
-    for each in [score.correction for score in tried[-TRIED:]]:
+    tried = tried[-TRIED:]
+    if any(each.correction.changes for each in tried):
+        as_sized = yield from _score(settings, events, AS_SIZED, known)
+    for each in [score.correction for score in tried]:
         score = yield from _score(settings, events, each, known)
         is_better = score.is_clearly_better(as_sized if each.changes else before)
         # In a frame of its own, where no map contradicts it, nothing is compared with the map.
@@ -204,28 +211,39 @@ def _findings(corrections: Iterable[Correction], known: Maps | None) -> list[Fin
 class _Score:
     """How likely points are, by what a filter expected of them that believes a correction.
 
-    ``mean`` is the ln of the density per unit of what was recorded, of which ``outlier`` is what
-    a point anywhere in view has; ``weight`` says how many points with new errors there are.
+    ``per_unit`` is added to ln densities, of which ``log_outlier`` is the one of a point anywhere
+    in view: they are per unit of what was recorded.
     """
 
     correction: Correction
-    mean: float
-    weight: float
-    outlier: float
+    likelihood: Likelihood
+    per_unit: float
+    log_outlier: float
     turned_rad: float  # at most since the start, as it is seen
     scale: float  # of the wheels
     range_scale: float
     localised_share: float  # of the observations, in a loaded map
 
+    @property
+    def mean(self) -> float:
+        """Ln of the density of a point, per unit of what was recorded."""
+        return self.likelihood.mean + self.per_unit
+
     def is_clearly_better(self, other: _Score) -> bool:
         """Return whether points are much likelier by this one."""
         gain = self.mean - other.mean
-        return gain > CLEAR and gain * min(self.weight, other.weight) > SURE
+        count = min(self.likelihood.count, other.likelihood.count)
+        return gain > CLEAR and gain * count > SURE
+
+    def until(self, stamp_ns: int) -> _Score:
+        """Return how likely points were up to a stamp."""
+        part = self.likelihood.select(self.likelihood.stamps_ns <= stamp_ns)
+        return replace(self, likelihood=part)
 
     @property
     def explains(self) -> bool:
         """Whether points are likelier than where they may be anywhere in view."""
-        return self.mean > self.outlier + 1.0
+        return self.likelihood.mean > self.log_outlier + 1.0
 
 
 def _score(
@@ -250,18 +268,20 @@ def _score(
     if known is not None:
         estimator.load_map(known)
     noise = ObservationNoise(settings) if correction.kind == 'tag_size' else None
-    for event in correction.apply(events, noise):
-        estimator.add(event)
+    for event in correction.apply(in_blocks(events), noise):
+        if isinstance(event, VelocityBlock):
+            estimator.add_velocities(event)
+        else:
+            estimator.add(event)
         yield
     estimator.flush()
     R = np.array(attitudes)
     found_out = {each.name.partition('/')[0]: each.value for each in estimator.calibration}
-    likelihood, per_unit = recorder.likelihood, k * math.log(scale)
     return _Score(
         correction,
-        likelihood.mean + per_unit,
-        likelihood.count,
-        recorder.log_outlier + per_unit,
+        recorder.likelihood,
+        k * math.log(scale),
+        recorder.log_outlier,
         float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
         found_out.get('linear_scale_x', 1.0),
         found_out.get('range_scale', 1.0),
