@@ -39,7 +39,9 @@ from slam_observer_ros.mapping.map_file import read_maps
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.runs.corrections import explained
 from slam_observer_ros.runs.health import of_half_points
+from slam_observer_ros.runs.input_health import of_publishers
 from slam_observer_ros.runs.mistakes import mistakes
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import message_types
@@ -70,7 +72,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'Say which Python, ROS and packages are found, and which topics with velocities or '
         'landmarks are alive. Topics are heard for some seconds, in the ROS domain of this shell. '
         'Of a recording, say which of the parameter files that come with the package fits it, and '
-        'why, and which mistake of the set-up (signs, units, frames) explains it better.'
+        'why, and which mistake of the set-up (signs, units, frames) explains it better, or whether '
+        'two publish velocities on one topic.'
     )
     parser.add_argument(
         'recording', nargs='?', type=named_path, metavar='RECORDING', help='as replay takes it'
@@ -100,6 +103,9 @@ def run(args: argparse.Namespace) -> None:
         findings = mistakes(shipped_settings(name), events, maps)
         if maps is not None:
             findings += of_anchors(shipped_settings(name), events, maps)
+        with Recording(args.recording) as recording:
+            selected = recording.find_topics()
+            findings = explained([*findings, *of_publishers(recording, selected)])
         if args.json:
             print_json(
                 {

@@ -162,6 +162,13 @@ KINDS = {
         'synchronise the clocks; a node with correct_clock_offset takes this recording, played '
         'with --clock, as it is',
     ),
+    'stamps_of_1970': Kind(
+        Level.WARNING,
+        'stamps of {topics} are of 1970: they count from the start of a driver or machine, or are '
+        'of a simulation',
+        'let it stamp with the time of ROS, or record all with use_sim_time; a node with '
+        'correct_clock_offset takes this recording, played with --clock, as it is',
+    ),
     'zero_stamps': Kind(
         Level.WARNING,
         'stamps are zero on {topics}; {count} messages have the time of their reception instead',

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from slam_observer_ros.common.errors import MessageError
-from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.common.stamps import is_of_1970, to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import AngularVelocityEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import CLOUDS, ID_NAME, missing_ids, read_fields
@@ -279,6 +279,15 @@ class Arrivals:
     def ahead_s(self) -> float:
         """How far the stamps are ahead of when they were received, seconds, in the median."""
         return -float(np.median(self._delays_s)) if self._delays_s else 0.0
+
+    @property
+    def counts_from_start(self) -> bool:
+        """Whether the stamps are of 1970, and the messages were not received then."""
+        if not self._delays_s:
+            return False
+        received_s = self._received_s[0]
+        stamp_s = received_s - float(np.median(self._delays_s))
+        return is_of_1970(to_ns(stamp_s)) and not is_of_1970(to_ns(received_s))
 
     def behind_s(self, other: Arrivals) -> float:
         """Return how far the stamps are behind another topic's, seconds.

@@ -94,6 +94,8 @@ def _remedy_where_none_was_used(
     recording: Recording, selected: SelectedTopics, inputs: InputSettings, dropped: Counter[str]
 ) -> str:
     """Return what may be wrong where no observation was used; empty if nothing is known."""
+    for finding in of_clocks(recording, selected):
+        return f'{finding.what}: {finding.remedy}'
     is_unplaced = recording.dropped[NO_TRANSFORM] > 0
     if dropped and not is_unplaced:
         return ''
@@ -117,7 +119,7 @@ def of_recording(
 
 
 def of_publishers(
-    recording: Recording, selected: SelectedTopics, inputs: InputSettings
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings = InputSettings()
 ) -> Iterator[Finding]:
     """Say on which of the topics of velocities more than one publishes, by what is on them."""
     decoders = input_decoders(selected, replace(inputs, velocity_source='twist'))
@@ -168,7 +170,7 @@ def of_timing(recording: Recording, selected: SelectedTopics) -> Iterator[Findin
             )
     if landmarks in inputs:
         yield from _of_end(landmarks, inputs[landmarks], start_s, end_s)
-    yield from _of_clocks(inputs)
+    yield from of_clocks(recording, selected)
 
 
 def _of_end(topic: str, arrivals: Arrivals, start_s: float, end_s: float) -> Iterator[Finding]:
@@ -179,12 +181,20 @@ def _of_end(topic: str, arrivals: Arrivals, start_s: float, end_s: float) -> Ite
         yield replace(finding, start_s=arrivals.last_s - start_s, end_s=duration_s)
 
 
-def _of_clocks(inputs: Mapping[str, Arrivals]) -> Iterator[Finding]:
-    """Say which inputs have stamps of the future, or far from the velocity's."""
-    (first_name, first), *others = inputs.items()
-    if first.ahead_s > MAX_AHEAD_S:
-        yield found('early_stamps', topic=first_name, ahead_s=first.ahead_s)
-    for name, arrivals in others:
+def of_clocks(recording: Recording, selected: SelectedTopics) -> Iterator[Finding]:
+    """Say which inputs have stamps of the future, of 1970, or far from the velocity's."""
+    read = recording.arrivals
+    inputs = {t.name: read[t.name] for t in selected.inputs if len(read.get(t.name, ()))}
+    of_1970 = [name for name, arrivals in inputs.items() if arrivals.counts_from_start]
+    if 0 < len(of_1970) < len(inputs):  # else all are of a simulation
+        yield found('stamps_of_1970', topics=' and '.join(of_1970))
+        return
+    for number, (name, arrivals) in enumerate(inputs.items()):
+        if not number:
+            first_name, first = name, arrivals
+            if first.ahead_s > MAX_AHEAD_S:
+                yield found('early_stamps', topic=name, ahead_s=first.ahead_s)
+            continue
         behind_s = arrivals.behind_s(first)
         is_early = min(arrivals.ahead_s, -behind_s) > MAX_AHEAD_S
         if is_early or abs(behind_s) > MAX_CLOCK_OFFSET_S:

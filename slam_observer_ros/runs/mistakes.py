@@ -18,6 +18,8 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
+from slam_observer_ros.common.stamps import to_ns
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
@@ -53,8 +55,17 @@ Result = TypeVar('Result')
 SURE, CLEAR = 25.0, 0.05
 """ln of how many times likelier all points must be, and each on average."""
 
+STRETCH_NS, FEW_EVENTS = to_ns(5.0), 4
+"""Stretches of a drive, and of how many all would be likelier if what helps were events.
+
+N gains that are equal, among others that are nothing, have a sum of √N times their norm.
+"""
+
 NOTABLE_TURN_RAD = 1.0
 """Turn, by what is seen, that a robot which turns without saying so shows at least."""
+
+UNKNOWN_TURN = 1.0
+"""Noise of a turning that is not known, rad/√s: robots turn by about one radian in a second."""
 
 ROUGHLY = 0.2
 """Deviation of a scale that is known to the next of the sizes that are tried."""
@@ -123,6 +134,9 @@ def _named(
     events = first_drive(recorded)
     if not any(len(each.ids) for each in events if isinstance(each, ObservationEvent)):
         return []
+    is_silent = never_turns(events)
+    if is_silent:  # how it turns is for the points to say
+        settings = replace(settings, angular_velocity_noise=(UNKNOWN_TURN,) * 3)
     before = yield from _score(settings, events, AS_IT_IS, known)
     best = yield from _best(settings, events, before, CORRECTIONS, known)
     if best is before:
@@ -132,16 +146,21 @@ def _named(
             if before.explains
             else (yield from _best(settings, events, before, PAIRS, known))
         )
-    if never_turns(events) and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
-        return [found('no_turning')]
-    if best is before or best.correction.parts:
-        return _findings(best.correction.parts, known)
-    first = best.correction
-    corrected, settings = list(first.apply(events)), replace(settings, **first.changes)
-    before = yield from _score(settings, corrected, AS_IT_IS, known)
-    others = [each for each in CORRECTIONS if first.goes_with(each)]
-    second = yield from _best(settings, corrected, before, others, known)
-    return _findings([first, *([] if second is before else [second.correction])], known)
+    silent = []
+    if is_silent and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
+        silent = [found('no_turning')]
+    parts = best.correction.parts
+    if best is not before and not parts:
+        first = best.correction
+        parts = (first,)
+        if not silent:
+            corrected, settings = list(first.apply(events)), replace(settings, **first.changes)
+            before = yield from _score(settings, corrected, AS_IT_IS, known)
+            others = [each for each in CORRECTIONS if first.goes_with(each)]
+            second = yield from _best(settings, corrected, before, others, known)
+            if second is not before:
+                parts = (first, second.correction)
+    return silent + _findings(parts, known)
 
 
 def _best(
@@ -194,7 +213,7 @@ def _sized(
 
 
 def _findings(corrections: Iterable[Correction], known: Maps | None) -> list[Finding]:
-    findings = []
+    findings: list[Finding] = []
     for each in corrections:
         if each.kind == 'tag_size':
             by = 'the wheels' if known is None else 'the map'
@@ -230,10 +249,27 @@ class _Score:
         return self.likelihood.mean + self.per_unit
 
     def is_clearly_better(self, other: _Score) -> bool:
-        """Return whether points are much likelier by this one."""
-        gain = self.mean - other.mean
+        """Return whether points are much likelier by this one, and not for a few events' sake.
+
+        Someone who carries the robot once makes a correction likelier that is wrong by and by.
+        """
         count = min(self.likelihood.count, other.likelihood.count)
-        return gain > CLEAR and gain * count > SURE
+        if not self.mean - other.mean > max(CLEAR, SURE / count if count else math.inf):
+            return False
+        ends_ns = [each.likelihood.stamps_ns[[0, -1]] for each in (self, other)]
+        edges = np.arange(np.min(ends_ns), np.max(ends_ns) + STRETCH_NS + 1, STRETCH_NS)
+        (one, counts), (another, other_counts) = (each._stretches(edges) for each in (self, other))
+        gains = np.minimum(counts, other_counts) * (one - another)
+        return bool(gains.sum() > math.sqrt(FEW_EVENTS * np.square(gains).sum()))
+
+    def _stretches(self, edges_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the mean, and how many observations with new errors, between stamps (m + 1,)."""
+        of, shares = self.likelihood, self.likelihood.shares
+        totals, counts = (
+            np.histogram(of.stamps_ns, edges_ns, weights=weights)[0]
+            for weights in (shares * (of.log_densities + self.per_unit), shares)
+        )
+        return totals / np.maximum(counts, np.finfo(float).tiny), counts
 
     def until(self, stamp_ns: int) -> _Score:
         """Return how likely points were up to a stamp."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import json
 
 from mistaken_drives import drive, MADE, SETTINGS, surveyed
@@ -9,7 +10,9 @@ import pytest
 from recordings import write_events
 
 from slam_observer_ros.cli.main import main
+from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.mapping.map_file import write_map
+from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.corrections import MISTAKES, SYMPTOMS
 
 OPTIONS = ('--config', 'wheeled_robot', '--set', 'bearing_noise=0.01')
@@ -60,6 +63,69 @@ def test_a_map_tells_a_mirror_image_from_a_wrong_sign(tmp_path, capsys, known):
     assert kinds(capsys.readouterr().out) == {'points_mirrored', 'turning_negated'}
     assert main(['doctor', path, '--load-map', known, '--json']) == 0
     assert kinds(capsys.readouterr().out) == {'turning_negated'}
+
+
+def beside(events, later_ns, frame):
+    """Return events to each velocity of which another publisher adds its own, 1.5 times as large."""
+    for event in events:
+        yield event
+        if isinstance(event, VelocityEvent):
+            yield replace(
+                event,
+                stamp_ns=event.stamp_ns + later_ns,
+                body_velocity=1.5 * event.body_velocity,
+                receive_ns=event.stamp_ns,
+                sensor_frame=frame,
+            )
+
+
+@pytest.mark.parametrize(
+    ('later_ns', 'frame', 'sign'),
+    [
+        (0, 'base_link', 'every second message is of another velocity'),
+        (7_000_000, 'base_link', 'every second message is of another velocity'),
+        (0, 'chassis', 'of the frames base_link, chassis'),
+        (-70_000_000, 'base_link', 'their stamps go back and forth'),
+    ],
+)
+def test_two_publishers_of_velocities_are_the_one_cause(tmp_path, capsys, later_ns, frame, sign):
+    path = tmp_path / 'run.mcap'
+    with RecordingWriter(path) as writer:
+        for event in beside(drive(seconds=30.0), later_ns, frame):
+            received_ns = (event.receive_ns or event.stamp_ns) + 10**9
+            stamped = replace(event, stamp_ns=event.stamp_ns + 10**9)
+            if isinstance(event, VelocityEvent):
+                named = event.sensor_frame or 'base_link'
+                writer.write_velocity(stamped, frame_id=named, receive_stamp_ns=received_ns)
+            else:
+                writer.write_observation(stamped)
+    for command in ('replay', 'doctor'):
+        options = OPTIONS if command == 'replay' else ()
+        assert main([command, str(path), *options, '--json']) == 0
+        findings = json.loads(capsys.readouterr().out)['findings']
+        (rivals,) = [each for each in findings if each['kind'] == 'several_publishers']
+        assert sign in rivals['what']
+        assert not {each['kind'] for each in findings} & (SYMPTOMS | MISTAKES)
+
+
+@pytest.mark.parametrize('topic', ['landmarks', 'twist'])
+def test_stamps_of_1970_are_named_and_no_clock_is_to_be_synchronised(tmp_path, capsys, topic):
+    path, now_ns = tmp_path / 'run.mcap', 1_760_000_000 * 10**9
+    with RecordingWriter(path) as writer:
+        for event in drive(seconds=20.0):
+            is_velocity = isinstance(event, VelocityEvent)
+            received_ns = event.stamp_ns + now_ns
+            stamped = replace(event, stamp_ns=received_ns)
+            write = writer.write_velocity if is_velocity else writer.write_observation
+            is_wrong = is_velocity == (topic == 'twist')
+            write(event if is_wrong else stamped, receive_stamp_ns=received_ns)
+    assert main(['replay', str(path), *OPTIONS, '--json']) == 0
+    printed = capsys.readouterr()
+    assert {'stamps_of_1970', 'no_observation'} == kinds(printed.out)
+    assert f'/{topic} are of 1970' in printed.err
+    assert 'synchronise' not in printed.out + printed.err
+    assert main(['replay', str(path), *OPTIONS, '--map', str(tmp_path / 'map.yaml')]) == 2
+    assert f'/{topic} are of 1970' in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_map_without_a_recording_is_refused_in_one_line(capsys, known):
