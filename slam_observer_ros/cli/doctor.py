@@ -72,8 +72,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'Say which Python, ROS and packages are found, and which topics with velocities or '
         'landmarks are alive. Topics are heard for some seconds, in the ROS domain of this shell. '
         'Of a recording, say which of the parameter files that come with the package fits it, and '
-        'why, and which mistake of the set-up (signs, units, frames) explains it better, or whether '
-        'two publish velocities on one topic.'
+        'why, and which mistake of the set-up (signs, units, frames) explains it better, '
+        'or whether two publish velocities on one topic.'
     )
     parser.add_argument(
         'recording', nargs='?', type=named_path, metavar='RECORDING', help='as replay takes it'

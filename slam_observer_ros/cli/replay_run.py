@@ -151,6 +151,8 @@ def _check_localised(
 def _never_found(result: Replay, maps: Sequence[LandmarkMap]) -> str:
     estimator = result.estimator
     problem = estimator.localisation_problem
+    if problem and problem.kind in ('other_hall', 'other_ids'):
+        return f'{problem.what}; {problem.remedy}'
     if problem and (is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)):
         return f'{problem.what}{_advice(result)}'
     least = 'two' if estimator.settings.two_d_mode else 'three'

@@ -353,6 +353,17 @@ KINDS = {
         GIVE_THE_POSE,
     ),
     'no_place': Kind(Level.WARNING, 'what was seen fits no place in {where} yet', GIVE_THE_POSE),
+    'other_hall': Kind(
+        Level.WARNING,
+        '{count} landmarks are seen whose ids the map has, and they lie to each other otherwise '
+        'than there',
+        'load the map of this place, or map it again if they were moved',
+    ),
+    'other_ids': Kind(
+        Level.WARNING,
+        '{count} landmarks lie to each other as in the map{name}, which has other ids there',
+        'see whether it is the map of a place built alike, or the ids were changed since',
+    ),
     'ambiguous_place': Kind(
         Level.WARNING, 'what was seen fits {number} in {where}, {places}', GIVE_THE_POSE
     ),

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.mapping.constellation import find_places, MAX_LOOKS
 from slam_observer_ros.mapping.landmark_map import LandmarkMap, MappedLandmarks
@@ -41,6 +41,9 @@ MAX_WEIGHED = 60
 
 MAX_FITTING = 50
 """Places that are weighed by all of these."""
+
+FEWEST_COMPARED = 2
+"""Landmarks beyond those that fix a place by which ids and places are compared."""
 
 NEWS = 1.3
 """How many times as often landmarks must have been seen before it is worth searching again."""
@@ -89,7 +92,8 @@ class Finder:
         self._ids = np.concatenate([known.ids for known in maps])
         self._has_warned = False  # of maps that look alike, to points without ids
         self.alike = AlikeMaps([], _likeness)
-        self._searched: tuple[int, int] | None = None
+        self._searched: dict[str, tuple[int, int]] = {}
+        self.contradiction: Finding | None = None  # of ids and places, as it was seen last
         self.places: Places | None = None  # that fit, when it was searched last
 
     def find(self, state: State) -> tuple[LandmarkMap, tuple[IntArray, IntArray]] | None:
@@ -97,7 +101,7 @@ class Finder:
 
         None unless there is one place that fits, or if nothing much is new since the last search.
         """
-        if not (rows := self._rows(state)).size or not self._is_due(state, rows):
+        if not (rows := self._rows(state)).size or not self._is_due(state, rows, 'sought'):
             return None
         P = state.gains.joint_covariance(rows)
         if P is None:
@@ -107,11 +111,48 @@ class Finder:
         ids = state.landmarks.ids[rows]
         self.places = places = self._search(seen, ids)
         place = places.decided(ERROR_PROBABILITY)
-        if place is None:
+        if place is None or self._note_ids(place, ids):
             return None
         matched = place.rows >= 0
         pairs = rows[matched], place.rows[matched]
         return self._maps[place.map_index].loaded, pairs
+
+    def compare_ids(self, state: State) -> None:
+        """See whether ids are those of a map and places are not, or the other way round."""
+        landmarks, fewest = state.landmarks, FEWEST_COMPARED + state.axes.point
+        rows = np.flatnonzero(~is_automatic(landmarks.ids) & (landmarks.counts >= MIN_COUNT))
+        if len(rows) < fewest or not self._is_due(state, rows, 'compared'):
+            return
+        P = state.gains.joint_covariance(rows)
+        if P is None:
+            return
+        p, nameless = state.axes.p, np.full(len(rows), -1)
+        seen = Constellation(state.observer.points[rows], P[p:, p:], nameless)
+        places = self._search(seen, nameless)
+        place = places.decided(ERROR_PROBABILITY)
+        if place is not None:
+            self._note_ids(place, landmarks.ids[rows])
+            return
+        named = int(np.isin(landmarks.ids[rows], self._ids).sum())
+        fits = places.likely or (self.places is not None and self.places.likely)
+        if named >= fewest and not fits:
+            self._contradict(found('other_hall', count=named))
+
+    def _note_ids(self, place: Place, ids: IntArray) -> bool:
+        """Note if a map has other ids at a place than landmarks (m,) have; return whether so."""
+        known, fits = self._maps[place.map_index].loaded, place.rows >= 0
+        others = known.ids[place.rows[fits]] != ids[fits]
+        count = int(np.count_nonzero(others & ~is_automatic(ids[fits])))
+        if 2 * count <= len(ids):
+            return False
+        name = f' {known.name}' if len(self._maps) > 1 else ''
+        self._contradict(found('other_ids', count=count, name=name))
+        return True
+
+    def _contradict(self, finding: Finding) -> None:
+        if self.contradiction is None or self.contradiction.kind != finding.kind:
+            logger.warning('%s', finding)
+        self.contradiction = finding
 
     def _rows(self, state: State) -> IntArray:
         """Return the landmarks to go by, those seen last first; none if their ids are enough."""
@@ -129,12 +170,12 @@ class Finder:
             return np.empty(0, dtype=np.int64)
         return rows[np.argsort(-landmarks.last_seen_ns[rows], kind='stable')][:MAX_WEIGHED]
 
-    def _is_due(self, state: State, rows: IntArray) -> bool:
-        """Return whether a search may say more than the last one."""
+    def _is_due(self, state: State, rows: IntArray, purpose: str) -> bool:
+        """Return whether a search may say more than the last one for that purpose."""
         seen_so_often = math.log(float(state.landmarks.counts[rows].sum()))
         news = (len(rows), int(seen_so_often / math.log(NEWS)))
-        is_due = news != self._searched
-        self._searched = news
+        is_due = news != self._searched.get(purpose)
+        self._searched[purpose] = news
         return is_due
 
     def _search(self, seen: Constellation, ids: IntArray) -> Places:

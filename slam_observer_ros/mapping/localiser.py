@@ -40,9 +40,6 @@ with many of them that takes long, and a single further observation seldom decid
 CONFIRMING_VOTES = 10
 """Observations that confirm a pose that was given."""
 
-LEAST_SHARE = 0.01
-"""Probability from which a place is named to a person."""
-
 MAX_NAMED = 3
 
 ROUGH_STD = np.repeat([0.5, 1.0], 3)
@@ -227,6 +224,12 @@ class Localiser:
         finder = self._finder
         return [] if finder is None or finder.places is None else finder.places.all
 
+    @property
+    def likely_places(self) -> list[Place]:
+        """Those of them that are worth to be named."""
+        finder = self._finder
+        return [] if finder is None or finder.places is None else finder.places.likely
+
     def problem(self, A: FloatArray) -> Finding | None:
         """Return why the pose in the map is not known, by Â (4, 4); None if it is."""
         if self.is_localised:
@@ -239,7 +242,9 @@ class Localiser:
             return found(
                 'drive_a_curve', number=len(finder.rivals), where=self._where, places=fits
             )
-        places = [place for place in self.places if place.share > LEAST_SHARE]
+        places = self.likely_places
+        if self._finder is not None and self._finder.contradiction is not None:
+            return self._finder.contradiction
         if not places:
             return found('no_place', where=self._where)
         maps = [place.map_index for place in places]
@@ -274,11 +279,13 @@ class Localiser:
                 len(places.all[0].rows),
                 places.error_probability,
             )
-        elif not self._said_problem and len([p for p in self.places if p.share > LEAST_SHARE]) > 1:
+        elif not self._said_problem and len(self.likely_places) > 1:
             self._said_problem = True
             finding = self.problem(state.observer.A)
             if finding is not None and finding.kind == 'ambiguous_place':  # others are known
                 logger.warning('%s', finding)
+        else:
+            self._finder.compare_ids(state)
 
     def enter(self, state: State) -> bool:
         """Move an estimate into the frame of a loaded map, if landmarks with ids suffice."""

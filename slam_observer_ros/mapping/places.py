@@ -61,6 +61,10 @@ SAMPLED = 64
 """Landmarks around which others are counted, to know how many are in view anywhere."""
 
 
+LEAST_SHARE = 0.01
+"""Probability from which a place is named to a person."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Constellation:
     """m points in one frame."""
@@ -127,6 +131,11 @@ class Places:
         ]
         is_complete = all(part.is_complete for part in parts.values())
         return cls.weighed(found, next(iter(parts.values())).log_none, is_complete)
+
+    @property
+    def likely(self) -> list[Place]:
+        """Return the places that are worth to be named."""
+        return [place for place in self.all if place.share > LEAST_SHARE]
 
     def decided(self, error_probability: float) -> Place | None:
         """Return the place that is wrong with at most this probability, if there is one."""

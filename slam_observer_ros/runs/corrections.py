@@ -147,6 +147,8 @@ SYMPTOMS = frozenset(
         'unmapped_points',
         'unknown_pose',
         'no_place',
+        'other_hall',
+        'other_ids',
         'drive_a_curve',
         'lost_pose',
         'wrong_pose',
@@ -187,7 +189,12 @@ OF_ODOMETRY = frozenset(
 )
 """Those of them that speak of the delay and the noise of the odometry."""
 
-_OF_POSE = frozenset({'unknown_pose', 'no_place', 'lost_pose', 'contradicted_pose', 'diverged'})
+_OF_POSE = frozenset(
+    {
+        *('unknown_pose', 'no_place', 'other_hall', 'other_ids'),
+        *('lost_pose', 'contradicted_pose', 'diverged'),
+    }
+)
 
 EXPLAINED: Mapping[str, frozenset[str]] = {
     **dict.fromkeys(MISTAKES, SYMPTOMS | {'rare_velocity'}),

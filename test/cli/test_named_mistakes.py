@@ -66,7 +66,7 @@ def test_a_map_tells_a_mirror_image_from_a_wrong_sign(tmp_path, capsys, known):
 
 
 def beside(events, later_ns, frame):
-    """Return events to each velocity of which another publisher adds its own, 1.5 times as large."""
+    """Return events, beside each velocity another publisher's, which is 1.5 times as large."""
     for event in events:
         yield event
         if isinstance(event, VelocityEvent):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from mistaken_drives import drive, SETTINGS, surveyed
 import numpy as np
 import pytest
 
@@ -82,3 +85,39 @@ def test_a_landmark_that_was_moved_beside_others_says_nothing_of_the_pose():
     robot.run(2.0, [0, 1, 2, 3])
     robot.run(2.0, [0])
     assert not any(robot.said)
+
+
+def in_a_map(*maps, ids=0):
+    """Return an estimator that has driven for some seconds, with its ids moved on."""
+    estimator = Estimator(SETTINGS)
+    estimator.load_map(list(maps))
+    for event in drive(seconds=6.0):
+        is_seen = isinstance(event, ObservationEvent)
+        estimator.add(replace(event, ids=event.ids + ids) if is_seen else event)
+    return estimator
+
+
+def test_a_hall_with_the_ids_of_another_is_named(caplog):
+    hall, other = surveyed(), surveyed(seed=1)
+    assert in_a_map(hall).localisation_problem is None
+    estimator = in_a_map(other)
+    assert not estimator.is_localised
+    assert estimator.localisation_problem.kind == 'other_hall'
+    # Of what is of no map's ids or places nothing is known.
+    foreign = replace(other, ids=other.ids + 100)
+    assert in_a_map(foreign).localisation_problem.kind == 'no_place'
+    assert sum('lie to each other otherwise' in line for line in caplog.messages) == 1
+
+
+def test_a_hall_in_which_the_ids_are_others_is_named_whichever_map_has_them(caplog):
+    hall, other = surveyed(), surveyed(seed=1)
+    shuffled = replace(hall, ids=np.random.default_rng(5).permutation(hall.ids))
+    assert in_a_map(shuffled).localisation_problem.kind == 'other_ids'
+    assert in_a_map(hall, ids=100).localisation_problem.kind == 'other_ids'
+    two = replace(hall, name='a'), replace(other, ids=other.ids + 100, name='b')
+    assert in_a_map(*two).is_localised
+    caplog.clear()
+    estimator = in_a_map(*two, ids=100)
+    assert not estimator.is_localised
+    assert 'as in the map a, which has other ids' in str(estimator.localisation_problem)
+    assert len(caplog.messages) == 1
