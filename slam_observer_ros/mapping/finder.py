@@ -118,7 +118,7 @@ class Finder:
         return self._maps[place.map_index].loaded, pairs
 
     def compare_ids(self, state: State) -> None:
-        """See whether ids are those of a map and places are not, or the other way round."""
+        """See whether a map has the ids but other places, or the places but other ids."""
         landmarks, fewest = state.landmarks, FEWEST_COMPARED + state.axes.point
         rows = np.flatnonzero(~is_automatic(landmarks.ids) & (landmarks.counts >= MIN_COUNT))
         if len(rows) < fewest or not self._is_due(state, rows, 'compared'):

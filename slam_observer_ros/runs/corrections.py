@@ -134,6 +134,17 @@ MIRRORED = {'points_mirrored', 'turning_negated'}
 ALIKE = (MIRRORED, {'points_backwards', 'driving_negated'})
 """Mirror images of each other, and what differs by which end of the robot is its front."""
 
+IN_MAP = (
+    *CORRECTIONS,
+    Correction(
+        '',
+        np.diag([1.0, -1.0, 1.0]),
+        turn=-1.0,
+        parts=tuple(each for each in CORRECTIONS if each.kind in MIRRORED),
+    ),
+)
+"""With both mirror images at once, of which a robot without a map notices nothing."""
+
 PAIRS = tuple(
     one.and_then(other)
     for one, other in combinations([each for each in CORRECTIONS if not each.changes], 2)

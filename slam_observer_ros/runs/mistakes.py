@@ -41,6 +41,7 @@ from slam_observer_ros.runs.corrections import (
     first_drive,
     in_blocks,
     IN_DEGREES,
+    IN_MAP,
     MIRRORED,
     never_turns,
     PAIRS,
@@ -138,7 +139,8 @@ def _named(
     if is_silent:  # how it turns is for the points to say
         settings = replace(settings, angular_velocity_noise=(UNKNOWN_TURN,) * 3)
     before = yield from _score(settings, events, AS_IT_IS, known)
-    best = yield from _best(settings, events, before, CORRECTIONS, known)
+    singles = CORRECTIONS if known is None else IN_MAP
+    best = yield from _best(settings, events, before, singles, known)
     if best is before:
         # As with points in millimetres and in a camera's axes, where no single one helps.
         best = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mistaken_drives import drive, MADE, PERIOD_NS, SETTINGS
+from mistaken_drives import drive, MADE, PERIOD_NS, SETTINGS, surveyed
 import numpy as np
 import pytest
 
@@ -91,6 +91,27 @@ def test_two_mistakes_are_both_named():
     assert set(named(list(twice))) == {'points_in_millimetres', 'points_in_optical_axes'}
     twice = list(MADE['speed_in_kmh'].apply(MADE['turning_in_degrees'].apply(drive())))
     assert set(named(twice)) == {'speed_in_kmh', 'turning_in_degrees'}
+
+
+def test_in_a_map_both_mirror_images_at_once_are_named():
+    right = drive(seconds=30.0)
+    twice = list(MADE['points_mirrored'].apply(MADE['turning_negated'].apply(right)))
+    assert named(twice) == []  # a robot that is right, in a mirrored world
+    found_in_map = mistakes(SETTINGS, twice, surveyed())
+    assert {finding.kind for finding in found_in_map} == {'points_mirrored', 'turning_negated'}
+
+
+def test_no_turning_hides_no_other_mistake():
+    twice = list(MADE['no_turning'].apply(MADE['points_in_millimetres'].apply(drive())))
+    assert set(named(twice)) == {'no_turning', 'points_in_millimetres'}
+
+
+def test_somebody_who_carries_the_robot_makes_no_mistake_likelier():
+    """As for a while it turned the other way: what helps then is wrong before and after."""
+    events = drive()
+    a_while = range(len(events) // 2, 6 * len(events) // 10)
+    other_way = list(MADE['turning_negated'].apply(events))
+    assert named([other_way[i] if i in a_while else e for i, e in enumerate(events)]) == []
 
 
 def test_the_factor_of_a_size_is_estimated():
