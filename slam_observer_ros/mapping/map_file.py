@@ -29,7 +29,7 @@ from __future__ import annotations
 import base64
 import binascii
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
 import logging
 from pathlib import Path
@@ -76,8 +76,6 @@ _MAX_INT64 = 2**63 - 1
 _ROUNDED_NORM = 1e-2
 """By how much the norm of a quaternion that somebody wrote down may miss being one."""
 
-FIELDS = ('checksum', 'data')
-
 _COUNTED = ('id', 'position', 'sigma', 'covariance', 'orientation', 'orientation_sigma')
 
 _OPTIONAL = ('sigma', 'covariance', 'observations', 'orientation', 'orientation_sigma')
@@ -120,7 +118,8 @@ def write_map(
             for name, value in dataclasses.asdict(settings).items()
         }
     landmarks = _as_mappings(landmark_map)
-    lines = [f'- {_on_one_line(landmark)}' for landmark in landmarks]
+    on_one_line: Any = {'default_flow_style': True, 'sort_keys': False, 'width': 10**6}
+    lines = [f'- {yaml.dump(each, Dumper=_Dumper, **on_one_line)}' for each in landmarks]
     lines += _correlation_lines(landmark_map.joint_covariance, landmarks)
     try:
         with unfinished_file(path) as file:
@@ -256,13 +255,6 @@ def _as_mappings(landmark_map: LandmarkMap) -> list[dict[str, Any]]:
     return landmarks
 
 
-def _on_one_line(landmark: Mapping[str, Any]) -> str:
-    text: str = yaml.dump(
-        dict(landmark), Dumper=_Dumper, default_flow_style=True, sort_keys=False, width=10**6
-    )
-    return text
-
-
 def _parse(content: Any) -> LandmarkMap:
     if isinstance(content, dict) and {'image', 'resolution'} <= content.keys():
         raise OtherFileError("it is an occupancy grid, as map_server's, and no map of landmarks")
@@ -285,9 +277,17 @@ def _parse(content: Any) -> LandmarkMap:
         _expect(times == 1, f'landmark {landmark_id} is there {times} times')
     landmark_map = LandmarkMap(
         np.array(ids, dtype=np.int64),
-        np.array([_position(row) for row in rows], dtype=np.float64).reshape(-1, 3),
+        np.array(
+            [_numbers(row['position'], 3, f"landmark {row['id']}: 'position'") for row in rows]
+        ),
         _covariances(rows),
-        np.array([_observations(row) for row in rows], dtype=np.int64),
+        np.array(
+            [
+                _natural(row.get('observations', 0), f"landmark {row['id']}: 'observations'")
+                for row in rows
+            ],
+            dtype=np.int64,
+        ),
         frame_id,
         *_orientations(rows),
     )
@@ -304,14 +304,6 @@ def _landmark_id(row: Any, index: int) -> int:
     landmark_id = _natural(row['id'], f"{who}: 'id'")
     _expect(landmark_id <= MAX_ID, f"{who}: 'id' is {landmark_id}, beyond {MAX_ID}")
     return landmark_id
-
-
-def _position(row: Mapping[str, Any]) -> list[float]:
-    return _numbers(row['position'], 3, f"landmark {row['id']}: 'position'")
-
-
-def _observations(row: Mapping[str, Any]) -> int:
-    return _natural(row.get('observations', 0), f"landmark {row['id']}: 'observations'")
 
 
 def _orientations(
@@ -339,29 +331,28 @@ def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:
     """Return (n, 3, 3) covariances, m²; None where no landmark has one."""
     if not any('sigma' in row or 'covariance' in row for row in rows):
         return None
-    covariances = np.array([_covariance(row) for row in rows])
+    read: list[list[list[float]]] = []
+    for row in rows:
+        who = f'landmark {row["id"]}'
+        given = [name for name in ('sigma', 'covariance') if name in row]
+        _expect(len(given) < 2, f"{who} has both 'sigma' and 'covariance': leave one")
+        _expect(bool(given), f"{who} has no 'sigma' or 'covariance', as others have: give all one")
+        if 'sigma' in row:
+            (sigma_m,) = _numbers([row['sigma']], 1, f"{who}: 'sigma'")
+            _expect(sigma_m >= 0.0, f"{who}: 'sigma' is negative")
+            v = sigma_m**2
+            read.append([[v, 0.0, 0.0], [0.0, v, 0.0], [0.0, 0.0, v]])
+            continue
+        lines = row['covariance']
+        _expect(isinstance(lines, list) and len(lines) == 3, f"{who}: 'covariance' is not 3 × 3")
+        read.append([_numbers(line, 3, f"{who}: a row of 'covariance'") for line in lines])
+    covariances = np.array(read)
     is_wrong = ~are_covariances(covariances)
     if is_wrong.any():
         who = f'landmark {rows[int(is_wrong.argmax())]["id"]}'
         what = 'is not symmetric, or negative in some direction'
         raise MapError(f"{who}: 'covariance' {what}")
     return covariances
-
-
-def _covariance(row: Mapping[str, Any]) -> list[list[float]]:
-    who = f'landmark {row["id"]}'
-    given = [name for name in ('sigma', 'covariance') if name in row]
-    _expect(len(given) < 2, f"{who} has both 'sigma' and 'covariance': leave one")
-    _expect(bool(given), f"{who} has no 'sigma' or 'covariance', as others have: give all one")
-    if 'sigma' in row:
-        (sigma_m,) = _numbers([row['sigma']], 1, f"{who}: 'sigma'")
-        _expect(sigma_m >= 0.0, f"{who}: 'sigma' is negative")
-        variance_m2 = sigma_m**2
-        return [[variance_m2, 0.0, 0.0], [0.0, variance_m2, 0.0], [0.0, 0.0, variance_m2]]
-    lines = row['covariance']
-    _expect(isinstance(lines, list) and len(lines) == 3, f"{who}: 'covariance' is not 3 × 3")
-    what = f"{who}: a row of 'covariance'"
-    return [_numbers(line, 3, what) for line in lines]
 
 
 def _check_names(
@@ -424,26 +415,19 @@ def _correlations(
     own ``covariances`` (n, 3, 3), m², are known.
     """
     try:
-        return _checked_correlations(content, landmarks, covariances)
+        is_whole = isinstance(content, dict) and set(content) == {'checksum', 'data'}
+        _expect(is_whole, 'they are not of the form {checksum: …, data: …}')
+        is_of_these = content['checksum'] == _checksum(landmarks)
+        _expect(is_of_these, 'a landmark was added, removed, moved or changed since')
+        tags = sum('orientation' in row for row in landmarks)
+        _expect(covariances is not None, 'the landmarks have no covariances')
+        joint = _decoded(content['data'], 3 * (len(landmarks) + tags))
+        check_joint(joint, np.asarray(covariances))
     except MapError as error:
         raise MapError(
             f"its 'correlations' can't be used, {error}: delete the line that begins with "
             "'correlations:', and errors count as independent"
         ) from error
-
-
-def _checked_correlations(
-    content: Any, landmarks: Sequence[Mapping[str, Any]], covariances: FloatArray | None
-) -> FloatArray:
-    if not isinstance(content, dict) or set(content) != set(FIELDS):
-        raise MapError(f'they are not of the form {{{FIELDS[0]}: …, {FIELDS[1]}: …}}')
-    if content['checksum'] != _checksum(landmarks):
-        raise MapError('a landmark was added, removed, moved or changed since')
-    if covariances is None:
-        raise MapError('the landmarks have no covariances')
-    tags = sum('orientation' in row for row in landmarks)
-    joint = _decoded(content['data'], 3 * (len(landmarks) + tags))
-    check_joint(joint, covariances)
     return joint
 
 
@@ -471,12 +455,6 @@ def _decoded(data: Any, size: int) -> FloatArray:
 
 
 def _checksum(landmarks: Sequence[Mapping[str, Any]]) -> int:
-    numbers = [number for row in landmarks for number in _counted(row)]
-    return zlib.crc32(np.array(numbers, dtype='<f8').tobytes())
-
-
-def _counted(row: Mapping[str, Any]) -> Iterator[float]:
-    """Yield what a landmark's line says, in one order."""
-    for name in _COUNTED:
-        if name in row:
-            yield from np.ravel(row[name]).tolist()
+    """Return the CRC-32 of what the landmarks' lines say, in one order."""
+    numbers = [np.ravel(row[name]) for row in landmarks for name in _COUNTED if name in row]
+    return zlib.crc32(np.concatenate(numbers, dtype='<f8').tobytes())

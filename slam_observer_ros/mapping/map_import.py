@@ -1,19 +1,22 @@
 """Maps of other programs: tables, TagSLAM's bodies, bundles, FRC's fields, scanners' landmarks.
 
-In all of them but FRC's the axes of a tag are, seen from before the upright tag: x to the
-right, y up, z out of it. So TagSLAM and apriltag_ros have them, and AprilTags are upright as their
-makers print them.
+Tables are of people and spreadsheets, fiducial_slam's map.txt, and navigation scanners'. In all
+but FRC's fields the axes of a tag are, seen from before the upright tag: x to the right, y up, z
+out of it. So TagSLAM and apriltag_ros have them, and AprilTags are upright as their makers print
+them.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import csv
 import json
 import logging
 from pathlib import Path
-from typing import Any
+import re
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,20 +26,63 @@ from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.mapping.map_tables import (
-    facing,
-    finite,
-    naming,
-    QUATERNION,
-    reason,
-    Row,
-    scanner_rows,
-    table_rows,
-    turned,
-    UNITS,
-    UNKNOWN_NOISE,
-)
+from slam_observer_ros.mapping.landmark_map import LandmarkMap, MAX_NUMBER
+
+logger = logging.getLogger(__name__)
+
+NO_ORIENTATION = np.zeros((3, 3))
+
+UNKNOWN_NOISE = np.diag(np.full(3, np.nan))
+
+
+class Row(NamedTuple):
+    """A landmark as a file has it; NaN stands for the default."""
+
+    landmark_id: Any
+    position: FloatArray  # (3,) in the map, metres
+    orientation: FloatArray = NO_ORIENTATION  # (3, 3) from the tag's own axes; zero of a point
+    covariance: FloatArray = UNKNOWN_NOISE  # (3, 3) along the map's axes, m²
+    orientation_sigma_rad: float = np.nan
+
+
+def reason(error: Exception) -> str:
+    """Return what is wrong, also if it is a key that is missing."""
+    return f'{shown(error.args[0])} is missing' if isinstance(error, KeyError) else str(error)
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Name what it is of that can't be right."""
+    try:
+        yield
+    except (MapError, KeyError, ValueError) as error:
+        raise MapError(f'{what}: {reason(error)}') from error
+
+
+def finite(written: Any, name: str) -> float:
+    """Return a number; raise a MapError that names it if it is none that a map can have."""
+    try:
+        number = float(written)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if not abs(number) <= MAX_NUMBER:  # nor NaN
+        raise MapError(f'{name} is {shown(written)}, which is not a finite number')
+    return number
+
+
+def turned(quaternion: Sequence[float]) -> FloatArray:
+    """Return the orientation (3, 3) of a quaternion x y z w."""
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1.0) > so3.QUATERNION_NORM_TOLERANCE:
+        raise MapError(f'the quaternion has norm {norm:.3g}, not 1')
+    return so3.from_quaternion(np.array(quaternion))
+
+
+def facing(yaw_rad: float) -> FloatArray:
+    """Return the orientation (3, 3) of an upright tag that looks in a direction."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[-s, 0.0, c], [c, 0.0, s], [0.0, 1.0, 0.0]])
+
 
 MAX_BYTES = 20_000_000
 
@@ -59,8 +105,6 @@ its coordinates are hardly in metres: no sensor sees two of them at once."""
 
 MAX_NAMED = 12
 """Of what is left out, as many are named in one line."""
-
-logger = logging.getLogger(__name__)
 
 
 def import_map(
@@ -96,34 +140,43 @@ def import_map(
         logger.warning('%s', found('left_out_of_table', path=path, columns=columns))
     if not rows:
         raise MapError(f'{path}: there are no landmarks in it')
-    _check_ids(path, rows)
+    for row in rows:
+        if type(row.landmark_id) is not int or not 0 <= row.landmark_id <= MAX_ID:
+            raise MapError(
+                f'{path}: the id {shown(row.landmark_id)} is not one from 0 to {MAX_ID}'
+            )
+    landmark_id, count = Counter(row.landmark_id for row in rows).most_common(1)[0]
+    if count > 1:
+        raise MapError(f'{path}: landmark {landmark_id} is there more than once')
+    positions = np.array([row.position for row in rows])
+    covariances = np.array([row.covariance for row in rows])
     if unit is None:
-        _check_unit(path, rows)
-    elif UNITS[unit] != 1.0:
-        rows = [_scaled(row, UNITS[unit]) for row in rows]
-    return _as_map(rows, frame_id, sigma_m, orientation_sigma_rad, np.array(TAG_AXES[tag_axes]))
+        _check_unit(path, positions)
+    else:
+        positions, covariances = UNITS[unit] * positions, UNITS[unit] ** 2 * covariances
+    covariances[np.isnan(covariances)] = sigma_m**2
+    orientations = np.array([row.orientation for row in rows]) * np.array(TAG_AXES[tag_axes])
+    are_tags = orientations.any(axis=(1, 2))
+    sigmas_rad = np.array([row.orientation_sigma_rad for row in rows])
+    sigmas_rad[np.isnan(sigmas_rad)] = orientation_sigma_rad
+    return LandmarkMap(
+        np.array([row.landmark_id for row in rows], dtype=np.int64),
+        positions,
+        covariances,
+        np.zeros(len(rows), dtype=np.int64),
+        frame_id,
+        orientations if are_tags.any() else None,
+        sigmas_rad * are_tags if are_tags.any() else None,
+    )
 
 
-def _rows(path: Path, left_out: list[str]) -> list[Row]:
-    if path.stat().st_size > MAX_BYTES:
-        raise MapError(f'it has more than {MAX_BYTES // 10**6} MB')
-    suffix = path.suffix.lower()
-    if suffix in ('.csv', '.txt', '.tsv'):
-        return table_rows(path, left_out)
-    if suffix in ('.imk', '.lmk'):
-        return scanner_rows(path)
-    if suffix == '.json':
-        return _field_rows(json.loads(read_text(path)))
-    return _yaml_rows(path, left_out)
-
-
-def _check_unit(path: Path, rows: Sequence[Row]) -> None:
-    """Ask what unit coordinates are in that look like millimetres."""
-    points = np.array([row.position for row in rows])
-    extent_m = float(np.ptp(points, axis=0).max())
-    if extent_m < WIDE_M or len(rows) < 2:
+def _check_unit(path: Path, positions: FloatArray) -> None:
+    """Ask what unit coordinates (n, 3) are in that look like millimetres."""
+    extent_m = float(np.ptp(positions, axis=0).max())
+    if extent_m < WIDE_M or len(positions) < 2:
         return
-    off_m = np.linalg.norm(points[:, None] - points, axis=2) + np.diag(np.full(len(rows), np.inf))
+    off_m = np.linalg.norm(positions[:, None] - positions, axis=2)
+    np.fill_diagonal(off_m, np.inf)
     if np.median(off_m.min(axis=1)) > SPARSE_M:
         raise MapError(
             f'{path}: the landmarks are {extent_m / 1000.0:.1f} km apart: are these millimetres? '
@@ -131,11 +184,16 @@ def _check_unit(path: Path, rows: Sequence[Row]) -> None:
         )
 
 
-def _scaled(row: Row, scale: float) -> Row:
-    return row._replace(position=scale * row.position, covariance=scale**2 * row.covariance)
-
-
-def _yaml_rows(path: Path, left_out: list[str]) -> list[Row]:
+def _rows(path: Path, left_out: list[str]) -> list[Row]:
+    if path.stat().st_size > MAX_BYTES:
+        raise MapError(f'it has more than {MAX_BYTES // 10**6} MB')
+    suffix = path.suffix.lower()
+    if suffix in ('.csv', '.txt', '.tsv'):
+        return _table_rows(path, left_out)
+    if suffix in ('.imk', '.lmk'):
+        return _scanner_rows(path)
+    if suffix == '.json':
+        return _field_rows(json.loads(read_text(path)))
     content = load_yaml(path, MAX_BYTES, plain_value)
     if isinstance(content, Mapping) and 'bodies' in content:
         return _tagslam_rows(content['bodies'], content.get('body_defaults') or {}, left_out)
@@ -264,26 +322,20 @@ def _axes(written: Mapping[str, Any], name: str) -> FloatArray:
     return np.array([finite(written[axis], f'{name} {axis}') for axis in 'xyz'])
 
 
-def _bundle_rows(bundles: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> list[Row]:
+def _bundle_rows(bundles: Sequence[Mapping[Any, Any]] | Mapping[str, Any]) -> list[Row]:
     """Return the tags of the one bundle in a file; what is left out of a pose is none."""
     if isinstance(bundles, Mapping):  # of ROS 2
         bundles = [bundles[name] for name in bundles['bundle_names']]
     if len(bundles) > 1:
         raise MapError(f'it has {len(bundles)} bundles, each in a frame of its own: leave one')
-    return [row for bundle in bundles for row in _rows_of_bundle(bundle)]
-
-
-def _rows_of_bundle(bundle: Mapping[Any, Any]) -> list[Row]:
-    if 'layout' in bundle:
-        return [_bundle_row(tag) for tag in bundle['layout']]
     rows = []
-    for tag_id in bundle['ids']:
-        with naming(f'tag {shown(tag_id)}'):
-            tag = bundle[tag_id] if tag_id in bundle else bundle[str(tag_id)]
-            names = ('x', 'y', 'z', 'qw', 'qx', 'qy', 'qz')
-            rows.append(
-                _bundle_row({'id': tag_id} | dict(zip(names, tag['transform'], strict=True)))
-            )
+    for bundle in bundles:
+        rows += [_bundle_row(tag) for tag in bundle.get('layout', ())]
+        for tag_id in bundle['ids'] if 'layout' not in bundle else ():
+            with naming(f'tag {shown(tag_id)}'):
+                tag = bundle[tag_id] if tag_id in bundle else bundle[str(tag_id)]
+                pose = zip(('x', 'y', 'z', 'qw', 'qx', 'qy', 'qz'), tag['transform'], strict=True)
+                rows.append(_bundle_row({'id': tag_id} | dict(pose)))
     return rows
 
 
@@ -309,33 +361,248 @@ def _field_rows(content: Any) -> list[Row]:
     return rows
 
 
-def _check_ids(path: Path, rows: Sequence[Row]) -> None:
-    for row in rows:
-        if type(row.landmark_id) is not int or not 0 <= row.landmark_id <= MAX_ID:
-            raise MapError(
-                f'{path}: the id {shown(row.landmark_id)} is not one from 0 to {MAX_ID}'
-            )
-    landmark_id, count = Counter(row.landmark_id for row in rows).most_common(1)[0]
-    if count > 1:
-        raise MapError(f'{path}: landmark {landmark_id} is there more than once')
+COLUMNS = ('id', 'x', 'y', 'z', 'sigma')
+"""Of a table without a header, in this order; z and sigma may be left out."""
+
+QUATERNION = ('qx', 'qy', 'qz', 'qw')
+
+SIGMAS = ('sigma_x', 'sigma_y', 'sigma_z')
+
+USED = (*COLUMNS, *SIGMAS, 'yaw', *QUATERNION, 'orientation_sigma')
+
+_KINDS = ('tag', 'marker', 'fiducial', 'landmark')
+
+OTHER_NAMES = {
+    **{name: 'id' for kind in _KINDS for name in (kind, f'{kind}_id')},
+    **{f'{before}{axis}': axis for before in ('t', 'pos_', 'position_') for axis in 'xyz'},
+}
+
+IGNORED = ('size', 'tag_size', 'observations')
+"""Columns of numbers that a map does without; others may be of a kind that changes it."""
+
+UNITS = {'': 1.0, 'm': 1.0, 'rad': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'deg': np.pi / 180.0}
+UNITS['°'] = UNITS['deg']
+
+UNKNOWN_M = 10.0
+"""Standard deviation of a height that a table does not have."""
+
+MAX_YAW_RAD = 6.3
+"""A larger one is taken to be in degrees."""
+
+_UNIT = re.compile(r'(.*?)\s*[\[(](.*)[\])]|(.+)_(m|mm|cm|rad|deg)')
+_COMMA_OF_DECIMALS = re.compile(r'[-+]?\d*,\d+(?:[eE][-+]?\d+)?')
+_WORDS = re.compile(r'(?:[^\s,]+|[-+]?\d*,\d+)(?:\s+(?:[^\s,]+|[-+]?\d*,\d+))+')
+"""What spaces separate; a comma inside is one of decimals."""
+
+_FIDUCIAL_SLAM = ('id', 'x', 'y', 'z', 'roll', 'pitch', 'yaw', 'variance', 'observations')
 
 
-def _as_map(
-    rows: Sequence[Row], frame_id: str, sigma_m: float, sigma_rad: float, axes: FloatArray
-) -> LandmarkMap:
-    """Return the map with orientations from a detector's ``axes`` (3,), signs of the files'."""
-    covariances = np.array([row.covariance for row in rows])
-    covariances[np.isnan(covariances)] = sigma_m**2
-    orientations = np.array([row.orientation for row in rows]) * axes
-    are_tags = orientations.any(axis=(1, 2))
-    sigmas_rad = np.array([row.orientation_sigma_rad for row in rows])
-    sigmas_rad[np.isnan(sigmas_rad)] = sigma_rad
-    return LandmarkMap(
-        np.array([row.landmark_id for row in rows], dtype=np.int64),
-        np.array([row.position for row in rows]),
-        covariances,
-        np.zeros(len(rows), dtype=np.int64),
-        frame_id,
-        orientations if are_tags.any() else None,
-        sigmas_rad * are_tags if are_tags.any() else None,
+def _table_rows(path: Path, left_out: list[str]) -> list[Row]:
+    """Read a table; names of columns that are left out are added to ``left_out``.
+
+    Cells are separated by commas, semicolons, tabs or spaces. Raises a MapError that names the
+    line if it can't be right.
+    """
+    text = read_text(path)
+    lines = _cells(text)
+    if not lines:
+        return []
+    if ',' not in text and _is_of_fiducial_slam(lines[0][1]):
+        return [_fiducial_slam_row(number, cells) for number, cells in lines]
+    names, scales, least = list(COLUMNS), [1.0] * len(COLUMNS), 0
+    if not _is_number(lines[0][1][0]):
+        names, scales = _columns(lines.pop(0)[1])
+        least = 1 + names.index('z') if 'z' in names else 0
+    left_out += _unused(names, lines)
+    rows = []
+    for number, cells in lines:
+        with naming(f'line {number}'):
+            if any(cells[len(names) :]):
+                raise MapError(f'it has more values than columns, which are {", ".join(names)}')
+            if len(cells) < least:  # as where a file was cut: z would pass for 0
+                raise MapError(f'it has fewer values than columns, which are {", ".join(names)}')
+            scaled = dict(zip(names, zip(cells, scales, strict=False), strict=False))
+            rows.append(_row({name: cell for name, cell in scaled.items() if cell[0]}))
+    return rows
+
+
+def _cells(text: str) -> list[tuple[int, list[str]]]:
+    """Return number and cells of each line that has any; comments are left out."""
+    lines = text.splitlines()
+    written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
+    if written and written[0].lower().startswith('sep='):  # for Excel
+        written.pop(0)
+    if not written:
+        return []
+    first = written[0]
+    if _is_number(first.split(',')[0].split(';')[0].split()[0]):
+        lines = [_uncommented(line) for line in lines]
+    delimiter = next((sign for sign in ';\t' if sign in first), ',')
+    is_spaced = delimiter == ',' and _WORDS.fullmatch(first.strip()) is not None
+    reader = csv.reader(lines, delimiter=delimiter)
+    found = (
+        enumerate(map(str.split, lines), 1)
+        if is_spaced
+        else ((reader.line_num, cells) for cells in reader)
     )
+    stripped = [(number, [_decimal(cell.strip()) for cell in cells]) for number, cells in found]
+    return [
+        (number, cells)
+        for number, cells in stripped
+        if any(cells) and not cells[0].startswith('#') and not cells[0].lower().startswith('sep=')
+    ]
+
+
+def _uncommented(line: str) -> str:
+    """Return a line as it is, or without its #, if it names the columns."""
+    bare = line.lstrip().lstrip('#').strip()
+    return bare if {'id', 'x', 'y'} <= set(re.split(r'[\s,;]+', bare.lower())) else line
+
+
+def _decimal(cell: str) -> str:
+    return cell.replace(',', '.') if _COMMA_OF_DECIMALS.fullmatch(cell) else cell
+
+
+def _columns(header: Sequence[str]) -> tuple[list[str], list[float]]:
+    """Return the names of columns, and by what their values are multiplied."""
+    names, scales = [], []
+    for written in header:
+        name, unit = written.lower(), ''
+        if match := _UNIT.fullmatch(name):
+            name, unit = (part for part in match.groups() if part is not None)
+        name = name.replace(' ', '_')
+        if unit not in UNITS and name in USED:
+            raise MapError(f"column '{written}' is of a unit that is not known here")
+        names.append(OTHER_NAMES.get(name, name))
+        scales.append(UNITS.get(unit, 1.0))
+    repeated = [name for name, count in Counter(names).items() if count > 1 and name]
+    if repeated:
+        raise MapError(f"column '{repeated[0]}' is there twice")
+    if missing := {'id', 'x', 'y'} - set(names):
+        raise MapError(f"there is no column '{min(missing)}'; it needs id, x and y")
+    return names, scales
+
+
+def _unused(names: Sequence[str], lines: Sequence[tuple[int, Sequence[str]]]) -> list[str]:
+    """Return the columns that are left out; refuse those whose numbers may change the map."""
+    unused = []
+    for column, name in enumerate(names):
+        numbers = [
+            (number, cells[column])
+            for number, cells in lines
+            if column < len(cells) and _is_number(cells[column])
+        ]
+        if name in USED or not name:
+            continue
+        if name in ('roll', 'pitch'):
+            numbers = [(number, cell) for number, cell in numbers if float(cell) != 0.0]
+        if numbers and name not in IGNORED:
+            number, cell = numbers[0]
+            known = ', '.join(USED)
+            is_tilt = name in ('roll', 'pitch')
+            turn = ' (a tag that is not upright takes a quaternion)' if is_tilt else ''
+            raise MapError(
+                f"line {number}: column '{name}' is {cell}, and is not known here{turn}; "
+                f'leave it out, or name it as one of {known}'
+            )
+        unused.append(f"column '{name}'")
+    return unused
+
+
+def _row(cells: Mapping[str, tuple[str, float]]) -> Row:
+    x, y, z = (_cell(cells, name) for name in 'xyz')
+    if 'id' not in cells or x is None or y is None:
+        raise MapError('it needs id, x and y')
+    written, _ = cells['id']
+    if not _is_number(written) or float(written) % 1.0 != 0.0:
+        raise MapError(f"the id '{written}' is no whole number")
+    sigma_m, sigma_rad = (_sigma(cells, name) for name in ('sigma', 'orientation_sigma'))
+    own = [_sigma(cells, name) for name in SIGMAS]
+    sigmas_m = np.where(np.isnan(own), sigma_m, own)
+    if z is None:
+        sigmas_m[2] = UNKNOWN_M
+    position = np.array([x, y, z or 0.0])
+    landmark_id = int(written) if written.lstrip('+-').isdigit() else int(float(written))
+    return Row(landmark_id, position, _orientation(cells), np.diag(sigmas_m**2), sigma_rad)
+
+
+def _sigma(cells: Mapping[str, tuple[str, float]], name: str) -> float:
+    """Return the standard deviation in a column; NaN if there is nothing."""
+    sigma = _cell(cells, name)
+    if sigma is not None and sigma < 0.0:
+        raise MapError(f'{name} is negative')
+    return np.nan if sigma is None else sigma
+
+
+def _orientation(cells: Mapping[str, tuple[str, float]]) -> FloatArray:
+    """Return the orientation (3, 3) in a table, zero if there is none."""
+    yaw_rad, values = _cell(cells, 'yaw'), [_cell(cells, name) for name in QUATERNION]
+    quaternion = [value for value in values if value is not None]
+    if yaw_rad is not None and quaternion:
+        raise MapError('it has a yaw and a quaternion: leave one')
+    if yaw_rad is not None:
+        if abs(yaw_rad) > MAX_YAW_RAD:
+            raise MapError(
+                f'yaw is {yaw_rad:g}, more than a turn: it must be in radians, '
+                "or its column named 'yaw [deg]'"
+            )
+        return facing(yaw_rad)
+    if not quaternion:
+        return NO_ORIENTATION
+    if len(quaternion) < len(QUATERNION):
+        raise MapError('a quaternion needs qx, qy, qz and qw')
+    return turned(quaternion)
+
+
+def _cell(cells: Mapping[str, tuple[str, float]], name: str) -> float | None:
+    """Return the number in a column; None if there is nothing."""
+    if name not in cells:
+        return None
+    written, scale = cells[name]
+    return finite(written, name) * scale
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_of_fiducial_slam(cells: Sequence[str]) -> bool:
+    """Return whether these are id, pose, variance, count and neighbours, all without names."""
+    count = len(_FIDUCIAL_SLAM)
+    whole = [cells[0], *cells[count - 1 :]]
+    return len(cells) >= count and all(map(_is_number, cells)) and all(map(str.isdigit, whole))
+
+
+def _fiducial_slam_row(number: int, cells: Sequence[str]) -> Row:
+    """Return a line of fiducial_slam's map: angles are in degrees, the variance is in m²."""
+    with naming(f'line {number}'):
+        if not _is_of_fiducial_slam(cells):
+            raise MapError(f'it is not laid out as the others: {" ".join(_FIDUCIAL_SLAM)}')
+        values = [finite(cell, name) for name, cell in zip(_FIDUCIAL_SLAM, cells, strict=False)]
+        x, y, z, *angles = values[1:7]
+        pose = se3.from_rpy((x, y, z, *np.radians(angles).tolist()))
+        variance = values[7] or np.nan  # zero of the one that the others are measured from
+        if variance < 0.0:
+            raise MapError('the variance is negative')
+        covariance = np.diag([variance] * 3)
+        return Row(int(cells[0]), pose[:3, 3], pose[:3, :3], covariance)
+
+
+def _scanner_rows(path: Path) -> list[Row]:
+    """Read the landmark file of a navigation scanner: id, x and y in mm, and what it is.
+
+    Type, subtype, size and layer, which may follow, say nothing of the place. Raises a MapError
+    that names the line if it can't be right.
+    """
+    rows = []
+    for number, cells in _cells(read_text(path)):
+        with naming(f'line {number}'):
+            if len(cells) < 3 or not all(map(_is_number, cells)):
+                raise MapError('it is not laid out as: globID x/mm y/mm type subtype size layerID')
+            mm = UNITS['mm']
+            rows.append(_row({'id': (cells[0], 1.0), 'x': (cells[1], mm), 'y': (cells[2], mm)}))
+    return rows
