@@ -13,11 +13,11 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.models.calibration import without_calibration
-from slam_observer_ros.runs.consistency import (
+from slam_observer_ros.runs.metrics import (
     average_nees_band,
     normalised_squared_errors,
+    pose_errors,
 )
-from slam_observer_ros.runs.metrics import pose_errors
 
 CHECKPOINT_S = 5
 

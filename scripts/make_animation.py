@@ -25,8 +25,8 @@ from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.recordings.data_sets import load_mrclam
 from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
 from slam_observer_ros.recordings.writer import DataSet
-from slam_observer_ros.runs.consistency import outlines
 from slam_observer_ros.runs.figures import PALE_BLUE, RED, STYLE
+from slam_observer_ros.runs.metrics import CHI_SQUARE_95
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters
@@ -129,7 +129,11 @@ def show(
         rotation[:2, :2] = TURN
         spread = rotation @ estimator.pose_covariance[3:, 3:] @ rotation.T
         centre = rotation @ now[:3, 3]
-        axes.plot(*outlines(centre[None], spread[None], (0, 1)).T, '-', color=RED, linewidth=1.0)
+        variances, directions = np.linalg.eigh(CHI_SQUARE_95 * spread[:2, :2])
+        turn = np.linspace(0.0, 2.0 * np.pi, 37)
+        half_axes = directions * np.sqrt(np.maximum(variances, 0.0))
+        ellipse = centre[:2, None] + half_axes @ np.stack([np.cos(turn), np.sin(turn)])
+        axes.plot(*ellipse, '-', color=RED, linewidth=1.0)
         seen = np.isin(data_set.landmarks.ids, estimator.last_update.ids)
         for point in landmarks[seen]:
             axes.plot(*np.array([centre[:2], point]).T, '-', color='#999999', linewidth=0.8)

@@ -23,8 +23,6 @@ from threadpoolctl import threadpool_limits
 import worlds
 from worlds import drive, Loop, simulated_settings, World
 
-from slam_observer_ros.cli.calibration_finder import CalibrationFinder
-from slam_observer_ros.cli.held_out import Material
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
@@ -32,8 +30,8 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory, Truth
-from slam_observer_ros.runs.consistency import anchored_average_nees
-from slam_observer_ros.runs.metrics import ConfigurationError
+from slam_observer_ros.runs.calibration import CalibrationFinder, Material
+from slam_observer_ros.runs.metrics import anchored_average_nees, ConfigurationError
 
 LOOPS = {
     'plane': Loop('wheeled_bearing_range', 60.0, 150.0, 20, 6.0, 5),

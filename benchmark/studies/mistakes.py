@@ -28,8 +28,7 @@ from worlds import World
 
 from slam_observer_ros.events import Event, ObservationEvent
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.runs.corrections import Correction, OPTICAL
-from slam_observer_ros.runs.mistakes import mistakes
+from slam_observer_ros.runs.mistakes import Correction, mistakes, OPTICAL
 from slam_observer_ros.settings.estimator_settings import Settings
 
 MADE = {

@@ -34,8 +34,11 @@ from slam_observer_ros.lie.se3 import rigid_alignment
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_file import read_map, write_map
 from slam_observer_ros.models.calibration import without_calibration
-from slam_observer_ros.runs.consistency import normalised_squared_errors
-from slam_observer_ros.runs.metrics import ConfigurationError, pose_errors
+from slam_observer_ros.runs.metrics import (
+    ConfigurationError,
+    normalised_squared_errors,
+    pose_errors,
+)
 
 MAPPED_S, LOCALISED_S, CHECKPOINT_S = 50.0, 60.0, 2.0
 

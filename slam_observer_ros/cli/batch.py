@@ -1,56 +1,94 @@
-"""``slam-observer batch``: every recording with every setting, and a page that compares them."""
+"""``slam-observer batch``: every recording with every setting, and a page that compares them.
+
+A run that is done is a JSON line, appended when it is finished and never changed. Each shard has a
+file of its own, so that no two programs write to one; what one reads is all of them.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+import dataclasses
 from dataclasses import dataclass, replace
+import fcntl
+import glob
+import hashlib
+import itertools
+import json
 import logging
 import os
 from pathlib import Path
+import re
+import sys
+from typing import Any
 
-from slam_observer_ros.cli.batch_index import INDEX, SCORES, write_index
-from slam_observer_ros.cli.batch_jobs import (
-    find_recordings,
-    grid_points,
-    Job,
-    Line,
-    log_name,
-    make_job,
-    opened_log,
-    part_of,
-    read_logs,
-    shard_of,
-    write_failures,
-)
 from slam_observer_ros.cli.batch_pool import cluster_pool, local_pool, Pool
-from slam_observer_ros.cli.console import (
-    kept_warnings,
-    muted_warnings,
-    print_json,
-    print_table,
-    show_message,
-    show_runs,
+from slam_observer_ros.cli.console import print_json, print_table, show_message, show_progress
+from slam_observer_ros.cli.options import (
+    add_run_options,
+    add_settings_options,
+    check_directory,
+    named,
+    named_path,
+    parse_value,
+    read_given,
+    read_request,
 )
-from slam_observer_ros.cli.options import add_settings_options, named, named_path, read_given
-from slam_observer_ros.cli.outputs import check_directory
-from slam_observer_ros.cli.replay import as_json, identity, summary_rows
-from slam_observer_ros.cli.replay_files import write_report_of
-from slam_observer_ros.cli.replay_outcome import with_logged
-from slam_observer_ros.cli.replay_request import add_run_options, read_request, Records
-from slam_observer_ros.cli.replay_run import replayed
 from slam_observer_ros.common import __version__
-from slam_observer_ros.common.errors import IncompleteError, OutputError, UsageError
-from slam_observer_ros.common.files import destination
+from slam_observer_ros.common.errors import (
+    IncompleteError,
+    json_text,
+    OutputError,
+    shown,
+    UsageError,
+)
+from slam_observer_ros.common.files import destination, not_special, unfinished_file
+from slam_observer_ros.common.findings import kept_warnings, muted_warnings
+from slam_observer_ros.mapping.map_file import map_files
 from slam_observer_ros.recordings.opening import sha256_of
 from slam_observer_ros.recordings.trajectory import write_tum
+from slam_observer_ros.report.batch_index import FILES, INDEX, Line, SCORES, write_index
+from slam_observer_ros.report.page import write_report
+from slam_observer_ros.report.summary import as_json, FIGURES, identity, summary_rows
+from slam_observer_ros.runs.result import Request
+from slam_observer_ros.runs.run import result_of
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import InputSettings
+from slam_observer_ros.settings.parameter_table import changed_names, suggestion, table, Value
 
 logger = logging.getLogger(__name__)
 
-Failure = dict[str, object]
+_KNOWN = {row.name: row for row in (*table(InputSettings), *table(Settings))}
 
+_ID_DIGITS = 16
+
+Point = dict[str, Value]
+"""Values of the parameters of ``--grid``, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A run that is to be done; ``run_id`` is a hash of all that its figures depend on."""
+
+    run_id: str
+    recording_sha256: str
+    point: Point
+    request: Request
+
+    @property
+    def recording(self) -> Path:
+        """The recording that is replayed."""
+        return self.request.recording
+
+    @property
+    def file_stem(self) -> str:
+        """Name of its files, without a suffix; no other run has it."""
+        return f'{self.recording.stem}-{self.run_id}'
+
+
+Failure = dict[str, object]
 
 REPORTS, TRAJECTORIES = 'reports', 'trajectories'
 """Folders of ``--out`` for files of the runs."""
@@ -65,34 +103,28 @@ class Work:
     writes_trajectories: bool
     version: str = __version__
 
-    def __call__(self, job: Job) -> dict[str, object]:
+    def __call__(self, job: Job) -> Line:
         """Do a run, write its files, and return its line of the log."""
         if self.version != __version__:
             raise UsageError(f'this worker has version {__version__}, the batch {self.version}')
-        report = self._file(REPORTS, job, '.html') if self.writes_reports else None
-        tum = self._file(TRAJECTORIES, job, '.tum') if self.writes_trajectories else None
-        records = Records(poses=tum is not None, whole_run=report is not None)
+        report = f'{REPORTS}/{job.file_stem}.html' if self.writes_reports else None
+        tum = f'{TRAJECTORIES}/{job.file_stem}.tum' if self.writes_trajectories else None
+        request = replace(job.request, keeps_poses=tum is not None, keeps_run=report is not None)
         with kept_warnings() as warnings:
-            outcome, _ = replayed(replace(job.request, records=records), shows_progress=False)
-        outcome = with_logged(outcome, warnings)
+            result = result_of(request)
+        result = replace(result, logged=warnings)
         if tum is not None:
-            write_tum(outcome.trajectory, tum)
+            write_tum(result.trajectory, self.out / tum)
         if report is not None:
-            write_report_of(job.file_stem, outcome, summary_rows(outcome), report)
+            write_report(self.out / report, result, job.file_stem, summary_rows(result))
         return {
             'run': job.run_id,
             'grid': job.point,
-            'report': self._relative(report),
-            'trajectory': self._relative(tum),
-            **identity(job.recording, job.recording_sha256, outcome),
-            **as_json(outcome),
+            'report': report,
+            'trajectory': tum,
+            **identity(job.recording, job.recording_sha256, result),
+            **as_json(result),
         }
-
-    def _file(self, folder: str, job: Job, suffix: str) -> Path:
-        return self.out / folder / f'{job.file_stem}{suffix}'
-
-    def _relative(self, file: Path | None) -> str | None:
-        return None if file is None else file.relative_to(self.out).as_posix()
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -162,38 +194,61 @@ def run(args: argparse.Namespace) -> None:
     recordings, points = find_recordings(args.recordings), grid_points(args.grid)
     request = read_request(args, read_given(args), recordings[0])
     requests = [request.with_values(point) for point in points]
-    pool = _pool(args, len(recordings) * len(points))
+    # Asked before anything is written
+    pool = _pool(args, local_pool(args.workers), len(recordings) * len(points))
+    wanted = {'report': args.reports, 'trajectory': args.trajectories}
     _make_folders(args)
-    with opened_log(args.out / log_name('runs', args.shard)) as log:
+    failed_file = args.out / log_name('failed', args.shard)
+    with opened_log(args.out / log_name('runs', args.shard)) as append:
         done_before = read_logs(args.out)
-        hashes, failures = _hashes(args, recordings, len(points))
+        parts = zip(recordings, part_of(recordings, len(points), args.shard), strict=True)
+        parts_of_shard = {recording: part for recording, part in parts if part}
+        hashes, failures = _hashes(args, list(parts_of_shard))
         jobs = [
             make_job(
                 replace(requests[number], recording=recording), hashes[recording], points[number]
             )
-            for recording, part in _parts(args, recordings, len(points))
+            for recording, part in parts_of_shard.items()
             if recording in hashes
             for number in part
         ]
-        left = _without_repeats(
-            job for job in jobs if not _is_done(args, done_before.get(job.run_id))
-        )
+        left: dict[str, Job] = {}
+        for job in jobs:
+            line = done_before.get(job.run_id)
+            files = [] if line is None else [line[kind] for kind in wanted if wanted[kind]]
+            if line is not None and all(file and (args.out / file).is_file() for file in files):
+                continue
+            # Of recordings that are the same, the first stands for all.
+            first = left.setdefault(job.run_id, job)
+            if first is not job:
+                logger.warning('%s is the same as %s.', job.recording, first.recording)
         try:
-            ended_runs = pool.run(Work(args.out.absolute(), args.reports, args.trajectories), left)
-            for ended in show_runs(ended_runs, 'running', len(left)):
+            work = Work(args.out.absolute(), args.reports, args.trajectories)
+            for ended in show_progress(pool.run(work, left.values()), 'running', len(left)):
                 if ended.result is not None:
-                    log.append(ended.result)
+                    append(ended.result)
                 else:
                     failures.append(_failed(ended.job.recording, ended.failure, ended.job))
         except KeyboardInterrupt:
             show_message('warning', 'Stopped; the same command goes on from here.')
             raise
         finally:
-            write_failures(args.out / log_name('failed', args.shard), failures)
+            write_failures(failed_file, failures)
             with muted_warnings():  # which were shown before
                 lines = read_logs(args.out)
             write_index(args.out, lines, args.score)
-    _report(args, [job.run_id for job in jobs], len(left), failures)
+    runs = len({job.run_id for job in jobs})
+    counts = {'runs': runs, 'done_before': runs - len(left), 'failed': len(failures)}
+    index = {'index': str(args.out / INDEX)}
+    if args.json:
+        print_json({**counts, **index})
+    else:
+        rows = {name.replace('_', ' '): str(count) for name, count in counts.items()}
+        print_table(str(args.out), rows | index)
+    if failures:
+        raise IncompleteError(
+            f'{len(failures)} runs failed, see {failed_file}; the same command tries them again'
+        )
 
 
 def _worker_count(text: str) -> int:
@@ -202,10 +257,9 @@ def _worker_count(text: str) -> int:
     return int(text)
 
 
-def _pool(args: argparse.Namespace, jobs: int) -> Pool:
-    if args.scheduler is not None:
-        return cluster_pool(args.scheduler, jobs)
-    return local_pool(args.workers)
+def _pool(args: argparse.Namespace, local: Pool, jobs: int) -> Pool:
+    """Return the pool of ``--scheduler`` for so many jobs, or the one of this machine."""
+    return local if args.scheduler is None else cluster_pool(args.scheduler, jobs)
 
 
 def _make_folders(args: argparse.Namespace) -> None:
@@ -222,49 +276,19 @@ def _make_folders(args: argparse.Namespace) -> None:
         destination(args.out / file)
 
 
-def _is_done(args: argparse.Namespace, line: Line | None) -> bool:
-    """Return whether a run is in the log, and the files of it that are asked for are there."""
-    if line is None:
-        return False
-    wanted = {'report': args.reports, 'trajectory': args.trajectories}
-    files = [line[kind] for kind, is_wanted in wanted.items() if is_wanted]
-    return all(file is not None and (args.out / file).is_file() for file in files)
-
-
-def _parts(
-    args: argparse.Namespace, recordings: Sequence[Path], points: int
-) -> list[tuple[Path, range]]:
-    """Return the recordings of this shard, each with the points that it is to run."""
-    parts = zip(recordings, part_of(recordings, points, args.shard), strict=True)
-    return [(recording, part) for recording, part in parts if part]
-
-
 def _hashes(
-    args: argparse.Namespace, recordings: Sequence[Path], points: int
+    args: argparse.Namespace, recordings: Sequence[Path]
 ) -> tuple[dict[Path, str], list[Failure]]:
-    """Return the hash of each recording of this shard, and which can't be read."""
-    wanted = [recording for recording, _ in _parts(args, recordings, points)]
-    pool = Pool(ThreadPoolExecutor, args.workers)
-    if args.scheduler is not None:
-        pool = cluster_pool(args.scheduler, len(wanted))
+    """Return the hash of each recording, and which can't be read."""
+    pool = _pool(args, Pool(ThreadPoolExecutor, args.workers), len(recordings))
     hashes: dict[Path, str] = {}
     failures = []
-    for ended in show_runs(pool.run(sha256_of, wanted), 'hashing', len(wanted)):
+    for ended in show_progress(pool.run(sha256_of, recordings), 'hashing', len(recordings)):
         if ended.result is not None:
             hashes[ended.job] = ended.result
         else:
             failures.append(_failed(ended.job, ended.failure))
     return hashes, failures
-
-
-def _without_repeats(jobs: Iterable[Job]) -> list[Job]:
-    """Return jobs, each once: of recordings that are the same, the first stands for all."""
-    kept: dict[str, Job] = {}
-    for job in jobs:
-        first = kept.setdefault(job.run_id, job)
-        if first is not job:
-            logger.warning('%s is the same as %s.', job.recording, first.recording)
-    return list(kept.values())
 
 
 def _failed(recording: Path, reason: str, job: Job | None = None) -> Failure:
@@ -273,22 +297,194 @@ def _failed(recording: Path, reason: str, job: Job | None = None) -> Failure:
     return {'recording': str(recording), 'error': reason, **run}
 
 
-def _report(
-    args: argparse.Namespace, run_ids: Sequence[str], new: int, failures: Sequence[Failure]
-) -> None:
-    """Print what was done; raise an IncompleteError if something was not."""
-    failed_file = args.out / log_name('failed', args.shard)
-    counts = {
-        'runs': len(set(run_ids)),
-        'done_before': len(set(run_ids)) - new,
-        'failed': len(failures),
+def find_recordings(patterns: Iterable[str]) -> list[Path]:
+    """Return the recordings that paths and patterns name, each once; ``**`` is any folders."""
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        paths = [pattern]
+        if not Path(pattern).exists():
+            paths = glob.glob(pattern, recursive=True)  # noqa: PTH207 (it may begin with /)
+        if not paths:
+            raise UsageError(f"no file is named '{pattern}'")
+        found |= dict.fromkeys(Path(path) for path in sorted(paths))
+    return list(found)
+
+
+def grid_points(texts: Iterable[str]) -> list[Point]:
+    """Return every combination of the values of ``--grid NAME=VALUE,VALUE…``."""
+    axes: dict[str, list[Value]] = {}
+    for text in texts:
+        name, equals, values = text.partition('=')
+        if not (name and equals and values):
+            raise UsageError(f"--grid takes NAME=VALUE,VALUE…, not '{text}'")
+        if name not in _KNOWN:
+            raise UsageError(f"--grid: unknown parameter '{name}'{suggestion(name, _KNOWN)}")
+        if name in axes:
+            raise UsageError(f'--grid {name} is given twice')
+        # Not at the commas of a [list]
+        axes[name] = [
+            _KNOWN[name].check(parse_value(value)) for value in re.split(r',(?![^\[]*\])', values)
+        ]
+        for number, value in enumerate(axes[name]):
+            if value in axes[name][:number]:
+                raise UsageError(f'--grid {name}: {shown(value)} is given twice')
+    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+
+
+def shard_of(text: str) -> tuple[int, int]:
+    """Take ``i/N``, 1 ≤ i ≤ N, as an argparse type."""
+    found = re.fullmatch(r'(\d{1,6})/(\d{1,6})', text)
+    number, count = (int(word) for word in found.groups()) if found else (0, 0)
+    if not 1 <= number <= count:
+        raise argparse.ArgumentTypeError(f"a shard is i/N with i from 1 to N, not '{text}'")
+    return number, count
+
+
+def part_of(recordings: Sequence[Path], points: int, shard: tuple[int, int]) -> list[range]:
+    """Return which points a shard is to run of each recording: it takes runs in a row.
+
+    So it has to read as few recordings as can be.
+    """
+    number, count = shard
+    total = len(recordings) * points
+    first, last = ((number - 1) * total // count, number * total // count)
+    starts = range(0, total, points)
+    return [range(max(first - at, 0), min(max(last - at, 0), points)) for at in starts]
+
+
+def make_job(request: Request, sha256: str, point: Point) -> Job:
+    """Return the job of one recording at one point, whose values the request has."""
+    maps = [] if request.load_map is None else map_files(request.load_map)
+    map_bytes = b''.join(not_special(path).read_bytes() for path in maps)
+    settings, inputs = (
+        {name: getattr(of, name) for name in changed_names(of)}
+        for of in (request.settings, request.inputs)
+    )
+    depends_on = {
+        'recording': sha256,
+        'version': __version__,
+        'settings': settings,
+        'inputs': inputs,
+        'topics': dataclasses.astuple(request.topics),
+        'map': hashlib.sha256(map_bytes).hexdigest() if maps else None,
+        'smooth': request.smooth,
     }
-    if args.json:
-        print_json(counts | {'index': str(args.out / INDEX)})
-    else:
-        rows = {name.replace('_', ' '): str(count) for name, count in counts.items()}
-        print_table(str(args.out), rows | {'index': str(args.out / INDEX)})
-    if failures:
-        raise IncompleteError(
-            f'{len(failures)} runs failed, see {failed_file}; the same command tries them again'
+    text = json.dumps(depends_on, sort_keys=True).encode()
+    return Job(hashlib.sha256(text).hexdigest()[:_ID_DIGITS], sha256, point, request)
+
+
+_NEEDED = {
+    'run': str,
+    'recording': str,
+    'recording_sha256': str,
+    'version': str,
+    'settings': dict,
+    'grid': dict,
+    'warnings': list,
+}
+
+
+def log_name(kind: str, shard: tuple[int, int]) -> str:
+    """Return the name of a shard's file: of ``runs`` that are done, or have ``failed``."""
+    number, count = shard
+    return f'{kind}.jsonl' if count == 1 else f'{kind}-{number}-of-{count}.jsonl'
+
+
+def read_logs(directory: Path) -> dict[str, Line]:
+    """Return the lines of all files in a directory, by their runs; warn of what is no run.
+
+    What was run again, for files that were not asked for at first, has the files of all its lines.
+    """
+    lines: dict[str, Line] = {}
+    for file in sorted(directory.glob('runs*.jsonl')):
+        for line in _runs_of(file) if file.is_file() else ():
+            before = lines.get(line['run'], {})
+            files = {kind: line.get(kind) or before.get(kind) for kind in FILES}
+            lines[line['run']] = line | files
+    return lines
+
+
+@contextmanager
+def opened_log(path: Path) -> Iterator[Callable[[Mapping[str, object]], None]]:
+    """Give a function that appends a line, in one piece; it is on the disk when that returns.
+
+    An OutputError is raised if another batch is writing to the file, or a line can't be written.
+    """
+    with path.open('a+b', buffering=0) as file:  # what does not fit is not tried again at the end
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f'{path}: another batch is writing to it') from error
+        file.seek(0)
+        end = file.read().rpartition(b'\n')[2]
+        if end and _parsed(end):  # an editor has left out the end of the last line
+            file.write(b'\n')
+        else:  # a power cut has: that run is to be done again
+            file.seek(-len(end), os.SEEK_END)
+            file.truncate()
+
+        def append(line: Mapping[str, object]) -> None:
+            left = json_text(line).encode() + b'\n'
+            try:
+                while left:
+                    left = left[file.write(left) :]
+                os.fsync(file.fileno())
+            except OSError as error:
+                raise OutputError(f"can't write {path}: {error.strerror}") from error
+
+        yield append
+
+
+def write_failures(path: Path, failures: Iterable[Mapping[str, object]]) -> None:
+    """Write the runs that failed, a line each; without any there is no such file."""
+    lines = [json_text(failure) + '\n' for failure in failures]
+    if not lines:
+        path.unlink(missing_ok=True)
+        return
+    with unfinished_file(path) as file:
+        file.writelines(lines)
+
+
+def _runs_of(path: Path) -> Iterator[Line]:
+    """Give the lines of a file that are runs; what follows the last end of a line is none yet."""
+    faults: list[str] = []
+    for number, text in enumerate(path.read_bytes().rpartition(b'\n')[0].splitlines(), 1):
+        line = _parsed(text)
+        if fault := _fault_of(line):
+            faults.append(f'line {number}: {fault}')
+        else:
+            yield line
+    if faults:
+        logger.warning(
+            '%s: %d lines are no runs of a batch, and left out (%s).', path, len(faults), faults[0]
         )
+
+
+def _parsed(text: bytes) -> Any:
+    """Return what a line says, None if it is no JSON."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _fault_of(line: object) -> str:
+    """Return why a line is none of a run, as the index reads it; '' if it is one."""
+    if not isinstance(line, dict):
+        return 'no JSON object'
+    for name, kind in _NEEDED.items():
+        if not isinstance(line.get(name), kind):
+            return f"it has no '{name}' as a run has"
+    if not all(isinstance(warning, str) for warning in line['warnings']):
+        return 'a warning is no text'
+    for name in FIGURES:
+        if not (line.get(name) is None or _is_finite(line[name])):
+            return f"'{name}' is no number"
+    wrong = [kind for kind in FILES if not isinstance(line.get(kind), str | None)]
+    return f"'{wrong[0]}' is no file" if wrong else ''
+
+
+def _is_finite(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return -sys.float_info.max <= value <= sys.float_info.max

@@ -1,62 +1,63 @@
-"""``slam-observer calibrate``: mount, scales, biases, delay and noise of sensor and odometry."""
+"""``slam-observer calibrate``: mount, scales, biases, delay and noise of sensor and odometry.
+
+What a recording shows (``runs/calibration.py``) is stated as parameters, beside what it can't
+distinguish.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+import math
 from pathlib import Path
+from typing import Any
 
-from slam_observer_ros.cli.calibration_finder import CalibrationFinder, find_noise, growth
-from slam_observer_ros.cli.calibration_stated import (
-    depth_text,
-    Found,
-    is_off,
-    is_seen,
-    looked_for,
-    state_found,
-    Stated,
-    with_noise,
-)
-from slam_observer_ros.cli.console import (
-    muted_warnings,
-    print_columns,
-    print_json,
-    print_table,
-    shown_steps,
-)
-from slam_observer_ros.cli.held_out import (
-    check_improvement,
-    HELD_OUT_SHARE,
-    judge,
-    judged_by,
-    judged_lines,
-    Material,
-    read_held_out,
-    read_material,
-    Verdict,
-    verdict_lines,
-)
-from slam_observer_ros.cli.options import add_settings_options, Given, named_path, read_given
-from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
-from slam_observer_ros.cli.replay_request import (
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam_observer_ros.cli.console import print_columns, print_json, print_table, progress_bar
+from slam_observer_ros.cli.options import (
+    add_force_option,
     add_input_options,
+    add_settings_options,
+    check_inputs_are_kept,
+    check_outputs,
+    Given,
+    named_path,
+    read_given,
     read_request,
-    ReplayRequest,
-    select_inputs,
 )
 from slam_observer_ros.common import __version__
-from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.errors import IncompleteError, UsageError
+from slam_observer_ros.common.findings import muted_warnings
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.lie import so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_file import read_map
+from slam_observer_ros.models.calibration import Entry, OF_SENSOR, OF_VELOCITY
 from slam_observer_ros.recordings.opening import files_of
 from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.runs.calibration import (
+    CalibrationFinder,
+    find_noise,
+    Found,
+    growth,
+    HELD_OUT_SHARE,
+    judge,
+    Material,
+    read_material,
+    Verdict,
+)
 from slam_observer_ros.runs.health import of_mounting, of_noise
+from slam_observer_ros.runs.noise_search import NoiseFactor, of_motion, rounded, scaled
+from slam_observer_ros.runs.result import Request
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_file import write_found
+from slam_observer_ros.settings.parameter_table import Pose6
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -133,38 +134,61 @@ def run(args: argparse.Namespace) -> None:
             request = request.with_values({'localization_mode': 'uncertain'})
     check_inputs_are_kept({'--out': args.out}, read)
     check_outputs([args.out], args.force)
-    materials = _materials(args, request, survey)
+    # What is held out is only looked at, before the long search.
+    with muted_warnings():  # they are shown when it is judged
+        hashes = [_read(request, path, 1.0, survey).sha256 for path in args.hold_out]
+    share = 0.0 if args.hold_out else HELD_OUT_SHARE
+    materials = [_read(request, path, share, survey) for path in args.recordings]
+    hashes += [material.sha256 for material in materials]
+    if len(set(hashes)) < len(hashes):
+        raise UsageError('a recording is given twice; what is trained on can not be held out, too')
     # What the settings that are tried give reason to warn of is nobody's concern.
-    with muted_warnings(), shown_steps('calibrating') as advance:
-        found = _found(args, request, materials, given, advance)
-        pose = _sensor_pose(request, found)
-        stated = state_found(request.settings, request.inputs, found, pose)
+    with muted_warnings(), progress_bar('calibrating') as advance:
+        found = _found(args, request, materials, given, lambda: advance(1))
+        stated = state_found(request.settings, request.inputs, found, _sensor_pose(request, found))
         noisy = with_noise(stated, found, not _states_motion(materials))
         corrected = replace(request, inputs=stated.inputs)
         trained_on = materials
         if corrected != request:
-            trained_on = [_read(args, corrected, path, survey) for path in args.recordings]
-        before, after, after_noise = judged_by(
-            [request.settings, stated.settings, noisy.settings],
-            _held_out(args, (request, corrected), materials, trained_on, survey),
-        )
+            trained_on = [_read(corrected, path, share, survey) for path in args.recordings]
+        held_out: Iterable[tuple[Material, ...]] = zip(materials, trained_on, strict=True)
+        if args.hold_out:
+            requests = (request, corrected)
+            held_out = (
+                tuple(_read(each, path, 1.0, survey) for each in requests)
+                for path in args.hold_out
+            )
+        rows = [
+            (
+                as_given.judged(request.settings),
+                as_found.judged(stated.settings),
+                as_found.judged(noisy.settings),
+            )
+            for as_given, as_found in held_out
+        ]
+        if not all(len(judged.likelihood.stamps_ns) for row in rows for judged in row):
+            raise UsageError('nothing is seen twice in what is held out')
+        before, after, after_noise = map(list, zip(*rows, strict=True))
         # Noise that is found beside other things is left as it was if it is no improvement.
         if args.only == 'noise' or not judge(after, after_noise).objection:
             stated, after = noisy, after_noise
-        verdict = judge(before, after)
         gain = growth(
             [material.likelihood(request.settings) for material in materials],
             [material.likelihood(stated.settings) for material in trained_on],
         )
-    result = _Result(request.settings, materials, found, stated, gain, verdict)
-    _print(args, result)
-    check_improvement(verdict)
+    result = _Calibration(request.settings, materials, found, stated, gain, judge(before, after))
+    if args.json:
+        print_json(_as_json(args, result))
+    else:
+        _print(args, result)
+    if objection := result.verdict.objection:
+        raise IncompleteError(f'no improvement: on what was held out {objection}')
     if args.out is not None:
         _write(args, given, result)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Result:
+class _Calibration:
     """What came of a calibration; the ``gain`` of the log likelihood has its deviation."""
 
     before: Settings
@@ -174,31 +198,21 @@ class _Result:
     gain: tuple[float, float]
     verdict: Verdict
 
+    @property
+    def trades(self) -> list[Trade]:
+        """Pairs of values that can't be distinguished."""
+        of_size = [COMMON_SCALE] if self.found.has_no_size else []
+        return of_size + trades(self.found.parts, self.found.correlations)
 
-def _read(
-    args: argparse.Namespace, request: ReplayRequest, path: Path, survey: LandmarkMap | None
-) -> Material:
-    share = 0.0 if args.hold_out else HELD_OUT_SHARE
+
+def _read(request: Request, path: Path, share: float, survey: LandmarkMap | None) -> Material:
+    """Read a recording, of which a share, at its end, is held out."""
     return read_material(replace(request, recording=path), share, survey)
-
-
-def _materials(
-    args: argparse.Namespace, request: ReplayRequest, survey: LandmarkMap | None
-) -> list[Material]:
-    """Read what is trained on; what is held out is only looked at, before the long search."""
-    with muted_warnings():  # they are shown when it is judged
-        held_out = (one for (one,) in read_held_out([request], args.hold_out))
-        hashes = [material.sha256 for material in held_out]
-    materials = [_read(args, request, path, survey) for path in args.recordings]
-    hashes += [material.sha256 for material in materials]
-    if len(set(hashes)) < len(hashes):
-        raise UsageError('a recording is given twice; what is trained on can not be held out, too')
-    return materials
 
 
 def _found(
     args: argparse.Namespace,
-    request: ReplayRequest,
+    request: Request,
     materials: Sequence[Material],
     given: Given,
     advance: Callable[[], None],
@@ -209,27 +223,12 @@ def _found(
     return finder.find(args.keep_noise)
 
 
-def _held_out(
-    args: argparse.Namespace,
-    requests: tuple[ReplayRequest, ReplayRequest],
-    materials: Sequence[Material],
-    trained_on: Sequence[Material],
-    survey: LandmarkMap | None,
-) -> Iterator[tuple[Material, Material, Material]]:
-    """Yield each recording that is held out, as given, as found, and as found with its noise."""
-    pairs: Iterable[Sequence[Material]] = zip(materials, trained_on, strict=True)
-    if args.hold_out:
-        pairs = read_held_out(list(dict.fromkeys(requests)), args.hold_out, survey)
-    for pair in pairs:
-        yield pair[0], pair[-1], pair[-1]
-
-
-def _sensor_pose(request: ReplayRequest, found: Found) -> FloatArray | None:
+def _sensor_pose(request: Request, found: Found) -> FloatArray | None:
     """Return the pose (4, 4) of the only sensor; None if there are several, or it moves."""
     if len(found.frames) != 1:
         return None
     with Recording(request.recording) as recording:
-        selected, inputs, _ = select_inputs(request, recording)
+        selected, inputs, _ = request.select_inputs(recording)
         return recording.sensor_pose(selected, inputs, next(iter(found.frames)))
 
 
@@ -243,12 +242,9 @@ def _states_motion(materials: Sequence[Material]) -> bool:
     )
 
 
-def _print(args: argparse.Namespace, result: _Result) -> None:
+def _print(args: argparse.Namespace, result: _Calibration) -> None:
     """Print what was found, how well it is known, and how it does on what was held out."""
-    found, verdict = result.found, result.verdict
-    if args.json:
-        print_json(_as_json(args, result))
-        return
+    found = result.found
     title = ', '.join(str(path) for path in args.recordings)
     rows = [
         [part.name, str(part), looked_for(part), f'{100.0 * part.deviation / part.stated:.0f} %']
@@ -265,13 +261,18 @@ def _print(args: argparse.Namespace, result: _Result) -> None:
     lines |= {f'noise of {part.name}': str(part) for part in found.factors}
     to_do = [*of_mounting(found.parts), *of_noise(found.factors)]
     lines |= {f'to do: {finding.what}': finding.remedy for finding in to_do}
-    lines |= _open_questions(found)
+    unseen = [part.name for part in found.parts if not is_seen(part)]
+    if unseen:
+        lines['not seen'] = f'{", ".join(unseen)}: left as stated'
+    if found.too_noisy:
+        lines['too noisy'] = f'velocities for their scale: {", ".join(found.too_noisy)}'
+    lines |= {f'trade {i}': trade.text for i, trade in enumerate(result.trades, 1)}
     lines['log likelihood, gain'] = '{:.1f} ± {:.1f}'.format(*result.gain)
-    lines |= {f'held out: {name}': text for name, text in verdict_lines(verdict).items()}
+    lines |= {f'held out: {name}': text for name, text in _verdict_lines(result.verdict).items()}
     print_table('what it says' if rows else title, lines)
 
 
-def _as_json(args: argparse.Namespace, result: _Result) -> dict[str, object]:
+def _as_json(args: argparse.Namespace, result: _Calibration) -> dict[str, object]:
     found = result.found
     parameters = {
         name: value for _, values in result.stated.groups for name, value in values.items()
@@ -285,7 +286,7 @@ def _as_json(args: argparse.Namespace, result: _Result) -> dict[str, object]:
             | {'seen': part.deviation / part.stated, 'is_off': is_off(part)}
             for part in found.parts
         },
-        'trades': [asdict(trade) for trade in found.trades],
+        'trades': [asdict(trade) for trade in result.trades],
         'range_is_depth': found.range_is_depth,
         'depth_gain': found.depth_gain,
         'log_likelihood_gain': result.gain,
@@ -296,18 +297,20 @@ def _as_json(args: argparse.Namespace, result: _Result) -> dict[str, object]:
     }
 
 
-def _open_questions(found: Found) -> dict[str, str]:
-    """Return what the recording says little of, and why."""
-    unseen = [part.name for part in found.parts if not is_seen(part)]
-    lines = {'not seen': f'{", ".join(unseen)}: left as stated'} if unseen else {}
-    if found.too_noisy:
-        lines['too noisy'] = f'velocities for their scale: {", ".join(found.too_noisy)}'
-    for number, trade in enumerate(found.trades, 1):
-        lines[f'trade {number}'] = trade.text
+def _verdict_lines(verdict: Verdict) -> dict[str, str]:
+    """Return what was found on what was held out, before → after."""
+    lines = {
+        'log likelihood per observation': '{:.3f} → {:.3f}'.format(*verdict.log_likelihood),
+        'log likelihood, gain': f'{verdict.gain:.1f} ± {verdict.gain_deviation:.1f}',
+    }
+    if verdict.error_m is not None:
+        lines['configuration error, RMS'] = '{:.3f} → {:.3f} m'.format(*verdict.error_m)
+    if verdict.anees is not None:
+        lines['ANEES of the configuration'] = '{:.2f} → {:.2f}'.format(*verdict.anees)
     return lines
 
 
-def _write(args: argparse.Namespace, given: Given, result: _Result) -> None:
+def _write(args: argparse.Namespace, given: Given, result: _Calibration) -> None:
     """Write the parameter file."""
     held_out = [str(path) for path in args.hold_out] or ['the last third']
     where = 'the map being made' if args.survey is None else f'the map {args.survey.name}'
@@ -315,9 +318,236 @@ def _write(args: argparse.Namespace, given: Given, result: _Result) -> None:
         f'By slam-observer calibrate {__version__} in {where} from',
         *(f'  {one.path.name} (SHA-256 {one.sha256})' for one in result.materials),
         'log likelihood, gain: {:.1f} ± {:.1f}'.format(*result.gain),
-        *judged_lines(held_out, result.verdict),
+        'held out:',
+        *(f'  {name}' for name in held_out),
+        *(f'  {name}: {text}' for name, text in _verdict_lines(result.verdict).items()),
         'Values ± their standard deviations; what the recording says little of is as it was.',
         'Intervals of noise are of 95 %, by the curvature of the likelihood, as if all',
         'innovations were independent: errors that last make them too narrow.',
     ]
     write_found(args.out, head, given.values, result.stated.groups)
+
+
+MUCH = 0.9
+"""Correlation beyond which two values trade."""
+
+WELL_KNOWN = 0.1
+"""Standard deviation over that at the start, below which nobody minds."""
+
+_WORDS = {
+    'range_scale': 'range scale',
+    'linear_scale': 'wheel scale',
+    'angular_scale': 'scale of turning',
+    'angular_bias': 'bias of turning',
+    'linear_bias': 'bias of driving',
+    'velocity_delay': 'delay',
+    'sensor_rotation': 'mount angle',
+    'sensor_translation': 'mount offset',
+}
+
+_ADVICE = (
+    (
+        {'range_scale', 'linear_scale'},
+        'give a surveyed map (--map), or drive a measured distance and state it (--set '
+        'linear_scale, linear_scale_stddev)',
+    ),
+    ({'angular_scale', 'angular_bias'}, 'turn to both sides, fast and slowly'),
+    ({'sensor_translation'}, 'turn on the spot, to both sides'),
+    ({'velocity_delay'}, 'change speed and direction often'),
+)
+"""What distinguishes values, by their kinds, the first that fits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trade:
+    """Two values that grow or shrink together without any change in what is seen."""
+
+    names: tuple[str, str]
+    correlation: float
+    text: str
+
+
+COMMON_SCALE = Trade(
+    ('linear_scale_x', 'range_scale'),
+    1.0,
+    'range scale and wheel scale trade: the wheels are as the ranges have them; for both of them '
+    + _ADVICE[0][1],
+)
+"""What no map that is made on the way shows: how large it is."""
+
+
+def trades(parts: Sequence[CalibrationEstimate], correlations: FloatArray) -> list[Trade]:
+    """Return the pairs among parts (c,) that can't be distinguished, the closest first."""
+    unknown = np.array([part.deviation > WELL_KNOWN * part.stated for part in parts])
+    close = np.triu(np.abs(correlations) > MUCH, 1) & unknown & unknown[:, None]
+    found = []
+    for i, j in np.argwhere(close).tolist():
+        names, correlation = (parts[i].name, parts[j].name), float(correlations[i, j])
+        entries = [_entry_of(name) for name in names]
+        words = ' and '.join(sorted(map(_words, entries)))
+        kinds = {entry.parameter for entry in entries}
+        advice = next(
+            (advice for pair, advice in _ADVICE if pair <= kinds),
+            'drive with more changes, or state one of them with --set',
+        )
+        text = f'{words} trade (correlation {correlation:.2f}): {advice}'
+        found.append(Trade(names, correlation, text))
+    return sorted(found, key=lambda trade: -abs(trade.correlation))
+
+
+def _entry_of(name: str) -> Entry:
+    name = name.partition('/')[0]
+    return next(entry for entry in (*OF_VELOCITY, *OF_SENSOR) if entry.name == name)
+
+
+def _words(entry: Entry) -> str:
+    words = _WORDS.get(entry.parameter, entry.parameter.replace('_', ' '))
+    return words if entry.axis is None else f'{words} {"xyz"[entry.axis]}'
+
+
+SEEN = 0.5
+"""Standard deviation over that at the start up to which something was seen of a value."""
+
+OFF = 3.0
+"""Standard deviations from where it was stated beyond which a value is off."""
+
+CLEARLY_NOISIER = math.log(1.2)
+"""Logarithm of a factor of noise from which it is worth a change."""
+
+MOUNT = ('sensor_rotation', 'sensor_translation')
+
+Values = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """Settings that state what was found; ``groups`` are the same, each with a comment."""
+
+    settings: Settings
+    inputs: InputSettings
+    groups: list[tuple[str, Values]]
+
+
+def is_seen(part: CalibrationEstimate) -> bool:
+    """Return whether more is known of a value than at the start."""
+    return part.deviation <= SEEN * part.stated
+
+
+def is_off(part: CalibrationEstimate) -> bool:
+    """Return whether a value is surely another than was stated."""
+    return is_seen(part) and abs(part.value - part.nominal) > OFF * part.deviation
+
+
+def state_found(
+    settings: Settings, inputs: InputSettings, found: Found, sensor_pose: FloatArray | None
+) -> Stated:
+    """Return what was found as settings; ``sensor_pose`` (4, 4) is None if it is not constant.
+
+    Where several sensors are calibrated, or one that moves, only what is of the velocities.
+    """
+    is_one = len(found.frames) == 1
+    values: dict[str, Any] = {}
+    comments: dict[str, list[str]] = {}
+    for part in found.parts:
+        name = part.name.partition('/')[0]
+        if not is_seen(part) or (name.startswith(('sensor_', 'range_')) and not is_one):
+            continue
+        parameter, index = (entry := _entry_of(name)).parameter, entry.axis
+        if parameter not in MOUNT:
+            _put(values, settings, parameter, index, _as_known(part.value, part.deviation))
+        elif sensor_pose is None:
+            continue
+        if '_bias' not in name:  # which is another one on another day
+            deviation = _as_known(part.deviation, part.deviation)
+            _put(values, settings, f'{parameter}_stddev', index, deviation)
+        text = f'{part.name}: {part}, looked for within {looked_for(part)}'
+        comments.setdefault(parameter, []).append(text)
+    groups = [('\n'.join(lines), _of(parameter, values)) for parameter, lines in comments.items()]
+    if is_one and found.depth_gain is not None:
+        values['range_is_depth'] = found.range_is_depth
+        groups.append((depth_text(found), {'range_is_depth': found.range_is_depth}))
+    if sensor_pose is not None and any(parameter in comments for parameter in MOUNT):
+        pose = _corrected(sensor_pose, found.parts)
+        inputs = replace(inputs, sensor_pose=pose)
+        groups.append(('In place of /tf, which is better put right.', {'sensor_pose': pose}))
+    return Stated(replace(settings, **values), inputs, [group for group in groups if group[1]])
+
+
+def with_noise(stated: Stated, found: Found, states_motion: bool) -> Stated:
+    """Return the same with the noise that was found; of motion where messages state none."""
+    noise = list(found.noise)
+    factors = {part.name: part for part in found.factors} if states_motion else {}
+    for kind in of_motion(stated.settings):
+        part = factors.get(kind.name)
+        if part is None:
+            continue
+        log = math.log(part.factor)
+        if abs(log) > max(OFF * part.deviation, CLEARLY_NOISIER):
+            noise.append(NoiseFactor(kind, log, part.deviation))
+    kinds = [one.kind for one in noise]
+    settings = scaled(stated.settings, kinds, [one.log for one in noise])
+    names = [name for kind in kinds for name in kind.parameters]
+    figures: Values = {name: rounded(getattr(settings, name)) for name in names}
+    settings = replace(settings, **figures)
+    groups = [
+        (
+            f'Noise of {one.kind.name}: {one} what it was',
+            {name: getattr(settings, name) for name in one.kind.parameters},
+        )
+        for one in noise
+    ]
+    return replace(stated, settings=settings, groups=[*stated.groups, *groups])
+
+
+def looked_for(part: CalibrationEstimate) -> str:
+    """Return what was known of a value at the start, as text."""
+    factor, unit = part.for_people
+    return f'{factor * part.nominal:g} ± {factor * part.stated:.2g} {unit}'.rstrip()
+
+
+def depth_text(found: Found) -> str:
+    """Return in words whether ranges are depths, and by what."""
+    if found.depth_gain is None:
+        return 'range: what is seen is all around'
+    what = 'depth along the axis' if found.range_is_depth else 'range'
+    gain, deviation = found.depth_gain
+    kept = '' if found.range_is_depth == (gain > 0.0) else ', which is not sure, or was not asked'
+    return f'{what}: the log likelihood of depth is {gain:+.0f} ± {deviation:.0f} over range{kept}'
+
+
+def _put(
+    values: Values, settings: Settings, parameter: str, index: int | None, value: float
+) -> None:
+    if index is None:
+        values[parameter] = value
+        return
+    entries = list(values.get(parameter, getattr(settings, parameter)))
+    entries[index] = value
+    values[parameter] = tuple(entries)
+
+
+def _of(parameter: str, values: Values) -> Values:
+    names = (parameter, f'{parameter}_stddev')
+    return {name: values[name] for name in names if name in values}
+
+
+def _as_known(value: float, deviation: float) -> float:
+    """Return a value with two digits of its standard deviation, six decimals at most."""
+    decimals = 1 - math.floor(math.log10(deviation)) if deviation > 0.0 else 6
+    return round(value, min(max(decimals, 0), 6))
+
+
+def _corrected(pose: FloatArray, parts: Sequence[CalibrationEstimate]) -> Pose6:
+    """Return x y z and roll pitch yaw of a sensor, moved from its ``pose`` as it was found."""
+    moved = {}
+    for part in parts:
+        name = part.name.partition('/')[0]
+        if is_seen(part):
+            moved[name] = part.value
+    turn, shift = (
+        np.array([moved.get(f'{name}_{axis}', 0.0) for axis in 'xyz']) for name in MOUNT
+    )
+    R = so3.exp(turn) @ pose[:3, :3]
+    values = [*(pose[:3, 3] + shift), *Rotation.from_matrix(R).as_euler('xyz')]
+    x, y, z, roll, pitch, yaw = (round(float(value), 5) for value in values)
+    return x, y, z, roll, pitch, yaw

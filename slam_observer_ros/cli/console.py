@@ -10,14 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Siz
 from contextlib import contextmanager
 import logging
 import sys
-import threading
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from slam_observer_ros.common.errors import json_text
-from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.common.process import leaving_at_once
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
 PROGRAM = 'slam-observer'
@@ -36,122 +35,47 @@ class MessageHandler(logging.Handler):
         show_message(record.levelname.lower(), record.getMessage())
 
 
-class _Keeper(logging.Handler):
-    """Keeps the warnings: findings, and others as text."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.warnings: list[Finding | str] = []
-        self._thread = threading.get_ident()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep one record, unless another thread's run gave it."""
-        if record.thread != self._thread:
-            return
-        first = record.args[0] if isinstance(record.args, tuple) and record.args else None
-        text = ' '.join(record.getMessage().split())
-        self.warnings.append(first if isinstance(first, Finding) else text)
-
-
-@contextmanager
-def kept_warnings() -> Iterator[list[Finding | str]]:
-    """Give a list that the package's warnings are added to, beside being shown."""
-    keeper, package_logger = _Keeper(), logging.getLogger('slam_observer_ros')
-    package_logger.addHandler(keeper)
-    try:
-        yield keeper.warnings
-    finally:
-        package_logger.removeHandler(keeper)
-
-
-@contextmanager
-def muted_warnings() -> Iterator[None]:
-    """Show none of the package's warnings meanwhile."""
-    package_logger = logging.getLogger('slam_observer_ros')
-    level = package_logger.level
-    package_logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        package_logger.setLevel(level)
-
-
 def show_message(kind: str, text: str) -> None:
     """Write ``slam-observer: kind: text`` to standard error, above any progress bar."""
     if sys.stderr is not None:  # a shell may have closed it
         sys.stderr.write(f'{PROGRAM}: {kind}: {" ".join(text.split())}\n')
 
 
-def show_progress(items: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
-    """Pass items on, with a progress bar on standard error where that is a terminal.
+@contextmanager
+def progress_bar(description: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
+    """Give a function to be called with how much was done of a ``total``, or of no known one.
 
-    An item that has a length is so many of the ``total``.
+    That shows on standard error, where that is a terminal.
     """
     with leaving_at_once():
+        from rich import progress
         from rich.console import Console
-        from rich.progress import Progress
 
     console = Console(stderr=True, highlight=False)
     if not console.is_terminal:
-        yield from items
+        yield lambda _: None
         return
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task(description, total=total)
+    columns = (
+        progress.TextColumn('{task.description}'),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+    )
+    # Each step may take minutes: all of them judge the time left, not the last 30 seconds.
+    with progress.Progress(
+        *columns, console=console, transient=True, speed_estimate_period=_FOREVER_S
+    ) as shown:
+        task = shown.add_task(description, total=total)
+        yield lambda count: shown.advance(task, count)
+
+
+def show_progress(items: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
+    """Pass items on, with a progress bar; one that has a length is so many of the ``total``."""
+    with progress_bar(description, total) as advance:
         for item in items:
             yield item
-            progress.advance(task, len(item) if isinstance(item, Sized) else 1)
-
-
-def show_runs(runs: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
-    """Pass on what takes long each, with how many there were and the time left, on a terminal."""
-    with leaving_at_once():
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-    console = Console(stderr=True, highlight=False)
-    columns = (
-        TextColumn('{task.description}'),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    # Each may take minutes: the time left is judged by all of them, not by the last 30 seconds.
-    with Progress(
-        *columns,
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-        speed_estimate_period=_FOREVER_S,
-    ) as progress:
-        yield from progress.track(runs, total, description=description)
-
-
-@contextmanager
-def shown_steps(description: str) -> Iterator[Callable[[], None]]:
-    """Give a function to be called at each step of what has no known end, to show their number."""
-    with leaving_at_once():
-        from rich.console import Console
-        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True, highlight=False)
-    columns = (
-        SpinnerColumn(),
-        TextColumn('{task.description}, step {task.completed}'),
-        TimeElapsedColumn(),
-    )
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
-        task = progress.add_task(description, total=None)
-        yield lambda: progress.advance(task)
+            advance(len(item) if isinstance(item, Sized) else 1)
 
 
 def print_json(result: Mapping[str, object]) -> None:
@@ -161,10 +85,13 @@ def print_json(result: Mapping[str, object]) -> None:
 
 def print_table(title: str, rows: Mapping[str, str]) -> None:
     """Print names and values on standard output."""
+    _console().print(table_of(title, rows))
+
+
+def _console() -> Console:
     with leaving_at_once():
         from rich.console import Console
-
-    Console(highlight=False, markup=False).print(table_of(title, rows))
+    return Console(highlight=False, markup=False)
 
 
 def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -172,12 +99,10 @@ def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[s
 
     Columns that don't fit beside each other follow below, in a table of their own.
     """
-    with leaving_at_once():
-        from rich.cells import cell_len
-        from rich.console import Console
-        from rich.table import Table
+    console = _console()
+    from rich.cells import cell_len
+    from rich.table import Table
 
-    console = Console(highlight=False, markup=False)
     columns = list(zip(headings, *rows, strict=True))
     widths = [max(map(cell_len, column)) + _COLUMN_FRAME for column in columns]
     tables: list[list[int]] = [[0, 1]]

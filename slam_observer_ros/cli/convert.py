@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.options import named, named_path
-from slam_observer_ros.cli.outputs import (
+from slam_observer_ros.cli.options import (
     add_force_option,
     check_inputs_are_kept,
     check_outputs,
+    named,
+    named_path,
     recording_path,
 )
 from slam_observer_ros.common.errors import OutputError

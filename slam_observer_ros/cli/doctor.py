@@ -21,7 +21,7 @@ from slam_observer_ros.cli.console import print_json, print_table
 from slam_observer_ros.cli.options import find_config, named_path
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.common.findings import Finding
+from slam_observer_ros.common.findings import explained, Finding
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
@@ -39,10 +39,9 @@ from slam_observer_ros.mapping.map_file import read_maps
 from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.recordings.reader import Recording
-from slam_observer_ros.runs.corrections import explained
 from slam_observer_ros.runs.health import of_half_points
-from slam_observer_ros.runs.input_health import of_publishers
 from slam_observer_ros.runs.mistakes import mistakes
+from slam_observer_ros.runs.run_health import of_publishers
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import message_types
 from slam_observer_ros.settings.parameter_file import read_parameter_file

@@ -8,8 +8,13 @@ import math
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.options import named, named_path
-from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
+from slam_observer_ros.cli.options import (
+    add_force_option,
+    check_inputs_are_kept,
+    check_outputs,
+    named,
+    named_path,
+)
 from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.map_alignment import Likeness
 from slam_observer_ros.mapping.map_check import (

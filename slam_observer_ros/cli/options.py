@@ -1,4 +1,7 @@
-"""Command-line options that several commands share: the estimator's settings, typed values."""
+"""What several commands share: options of settings and outputs, and typed values.
+
+Output files are refused before the work if they are in the way.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,16 @@ import logging
 import os
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from slam_observer_ros.cli.console import completed_by
 from slam_observer_ros.common.errors import ParameterError, UsageError
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.node_settings import (
+    InputSettings,
+    ObserverNodeSettings,
+    short_names,
+)
 from slam_observer_ros.settings.parameter_file import (
     mixed_lists,
     names_of_others,
@@ -30,6 +37,9 @@ from slam_observer_ros.settings.parameter_table import (
     table,
     Value,
 )
+
+if TYPE_CHECKING:
+    from slam_observer_ros.runs.result import Request
 
 logger = logging.getLogger(__name__)
 
@@ -89,10 +99,9 @@ class Given:
         return {**self.config, **self.assigned}
 
 
-def read_given(args: argparse.Namespace, config: str | None = None) -> Given:
-    """Read what the options of :func:`add_settings_options` give; ``config`` is for its file."""
-    name = args.config if config is None else config
-    file = None if name is None else find_config(name)
+def read_given(args: argparse.Namespace) -> Given:
+    """Read what the options of :func:`add_settings_options` give."""
+    file = None if args.config is None else find_config(args.config)
     return Given(
         file,
         {} if file is None else read_parameter_file(file),
@@ -219,6 +228,182 @@ def _parse_assignment(text: str) -> tuple[str, object]:
     if not (name and equals):
         raise UsageError(f"--set takes NAME=VALUE, not '{text}'")
     return name, parse_value(value)
+
+
+_INPUT_ROWS = {row.name: row for row in table(InputSettings)}
+
+INSTEAD = {
+    'map_file': '--load-map',
+    'autosave_map': '--map',
+    'velocity_type': '--velocity-topic',
+}
+"""Options of a replay for what the node does by these parameters."""
+
+
+def add_input_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of topics and inputs."""
+    landmarks, ambiguous = (
+        ', '.join(short_names('landmarks', is_ambiguous)) for is_ambiguous in (False, True)
+    )
+    topics = parser.add_argument_group(
+        'topics', 'found by their types; a name is needed only where two fit'
+    )
+    for option, what in (
+        ('--velocity-topic', ', '.join(short_names('velocity'))),
+        (
+            '--landmarks-topic',
+            f'{landmarks}, clouds with ids; if named here or called landmarks, also clouds '
+            f'without, and {ambiguous}; if named, /tf with fiducials',
+        ),
+        ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
+        ('--pose-truth-topic', f'true pose: {", ".join(short_names("pose"))}'),
+        ('--landmark-truth-topic', 'true landmarks'),
+    ):
+        topics.add_argument(option, type=named, metavar='TOPIC', help=what)
+    inputs = parser.add_argument_group(
+        'inputs', "the node's parameters of these names, which --config and --set give as well"
+    )
+    inputs.add_argument(
+        '--velocity-source',
+        choices=_INPUT_ROWS['velocity_source'].choices,
+        help='what of Odometry is used: its twist (default), or the differences of its poses',
+    )
+    inputs.add_argument(
+        '--base-frame',
+        type=named,
+        metavar='FRAME',
+        help='frame whose pose is estimated; other sensors are placed in it by /tf and '
+        '/tf_static (default: that of the velocities, or base_link if they name none)',
+    )
+    inputs.add_argument(
+        '--tag-frame-prefix',
+        metavar='PREFIX',
+        help="fiducials on /tf: a tag's frame before its id (default: "
+        f'{_INPUT_ROWS["tag_frame_prefix"].default}); family:id is known, too',
+    )
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how a recording is replayed, but for settings."""
+    add_input_options(parser)
+    parser.add_argument(
+        '--load-map',
+        type=named_path,
+        metavar='FILE',
+        help='known landmarks, as --map writes them, or a folder of such maps, one of them that '
+        'of the place: the estimate is then in their frame, and has no ANEES of the pose '
+        '(nor of the configuration, if they are fixed)',
+    )
+    parser.add_argument(
+        '--smooth',
+        action='store_true',
+        help='estimate trajectory and map from all observations together, too; --tum and --map '
+        'then write these',
+    )
+
+
+def read_request(args: argparse.Namespace, given: Given, recording: Path) -> Request:
+    """Return what the options of :func:`add_run_options` ask for, without any output.
+
+    A SlamObserverError is raised if settings are wrong, or don't fit the options.
+    """
+    from slam_observer_ros.recordings.topics import TopicNames  # which some commands do without
+    from slam_observer_ros.runs.result import Request
+
+    defaults = {'smoothing_window': 0} if args.smooth else {}
+    topics = TopicNames(
+        args.velocity_topic,
+        args.landmarks_topic,
+        args.pose_truth_topic,
+        args.landmark_truth_topic,
+        args.imu,
+    )
+    settings = settings_of(given, _INPUT_ROWS, INSTEAD, **defaults)
+    # Of --config, --set and the options themselves later ones win.
+    values: dict[str, object] = {'base_frame': ''}
+    values |= {name: value for name, value in given.values.items() if name in _INPUT_ROWS}
+    options = {
+        'velocity_source': args.velocity_source,
+        'base_frame': args.base_frame,
+        'tag_frame_prefix': args.tag_frame_prefix,
+        'use_imu': None if args.imu is None else True,
+    }
+    values |= {name: value for name, value in options.items() if value is not None}
+    inputs = from_parameters(InputSettings, values).with_plain_frames()
+    return Request(recording, settings, inputs, topics, args.load_map, args.smooth).checked()
+
+
+def warn_of_unused(args: argparse.Namespace, given: Given) -> None:
+    """Warn of what ``--config`` sets for the node, while the option for it here isn't given."""
+    defaults = {row.name: row.default for row in table(ObserverNodeSettings)}
+    unused = [
+        f'{name} (use {INSTEAD[name]})'
+        for name, value in given.config.items()
+        if name in INSTEAD
+        and value != defaults[name]
+        and getattr(args, INSTEAD[name].removeprefix('--').replace('-', '_')) is None
+    ]
+    if unused:
+        logger.warning('Not used of --config: %s.', ', '.join(unused))
+
+
+def add_force_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--force``."""
+    parser.add_argument('--force', action='store_true', help='replace files that exist already')
+
+
+def recording_path(text: str) -> Path:
+    """Take the name of a recording to be made, as an argparse type."""
+    path = Path(text)
+    if path.suffix != '.mcap':
+        raise argparse.ArgumentTypeError(f"recordings are .mcap files, so not '{text}'")
+    return path
+
+
+def check_outputs(files: Iterable[Path | None], force: bool) -> None:
+    """Raise a UsageError if a file can't be written, or not without ``force``; None is none."""
+    wanted = [file for file in files if file is not None]
+    for number, file in enumerate(wanted):
+        if file.is_dir():
+            raise UsageError(f'{file} is a directory; give the name of a file')
+        real = Path(os.path.realpath(file))  # which fails in no circle of links
+        if real.is_symlink():
+            raise UsageError(f'{file} is a link to itself; give another name')
+        if file.exists() and not file.is_file():
+            raise UsageError(f'{file} is there, and no regular file; give another name')
+        if file.exists() and not force:
+            raise UsageError(f'{file} exists already; give another name, or --force to replace it')
+        if not file.parent.is_dir():
+            raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
+        if not os.access(file.parent, os.W_OK):
+            raise UsageError(f'{file}: nothing may be written to {file.parent}')
+        if real in [Path(os.path.realpath(other)) for other in wanted[:number]]:
+            raise UsageError(f'{file} is named for two outputs')
+
+
+def check_inputs_are_kept(
+    outputs: Mapping[str, Path | None], inputs: Mapping[str, Iterable[Path]]
+) -> None:
+    """Raise a UsageError if an output would replace a file which is read, by whatever name.
+
+    Outputs are by option, None where not asked for; inputs by what they are.
+    """
+    read = {os.path.realpath(file): what for what, files in inputs.items() for file in files}
+    for option, file in outputs.items():
+        if file is not None and (what := read.get(os.path.realpath(file))) is not None:
+            raise UsageError(f'{option} {file} would replace {what}; give another name')
+
+
+def check_directory(directory: Path) -> None:
+    """Raise a UsageError if a directory is not there, and can't be made."""
+    if directory.is_dir():
+        return
+    if os.path.lexists(directory):
+        raise UsageError(f'{directory} is no directory; give the name of one')
+    if not directory.parent.is_dir():
+        raise UsageError(f'{directory}: there is no directory {directory.parent}; make it first')
+    if not os.access(directory.parent, os.W_OK):
+        raise UsageError(f'{directory}: nothing may be written to {directory.parent}')
 
 
 def parse_value(text: str) -> object:

@@ -1,37 +1,50 @@
-"""``slam-observer replay``: a recording through the estimator, and what is printed of it."""
+"""``slam-observer replay``: a recording through the estimator, and what is written of it."""
 
 from __future__ import annotations
 
 import argparse
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+import logging
 import math
 from pathlib import Path
 
-from slam_observer_ros.cli.console import kept_warnings, print_columns, print_json, print_table
-from slam_observer_ros.cli.options import add_settings_options, named_path, read_given
-from slam_observer_ros.cli.outputs import add_force_option
-from slam_observer_ros.cli.replay_files import (
-    add_output_options,
-    check_files,
-    records_of,
-    write_files,
+from slam_observer_ros.cli.console import (
+    print_columns,
+    print_json,
+    print_table,
+    show_progress,
 )
-from slam_observer_ros.cli.replay_outcome import ReplayOutcome, with_logged
-from slam_observer_ros.cli.replay_request import add_run_options, read_request, warn_of_unused
-from slam_observer_ros.cli.replay_run import replayed
-from slam_observer_ros.common import __version__
-from slam_observer_ros.common.errors import LossError, OutputError, UsageError
-from slam_observer_ros.estimates import point_share, Reason, used_points
+from slam_observer_ros.cli.options import (
+    add_force_option,
+    add_run_options,
+    add_settings_options,
+    check_inputs_are_kept,
+    check_outputs,
+    named_path,
+    read_given,
+    read_request,
+    recording_path,
+    warn_of_unused,
+)
+from slam_observer_ros.common.errors import (
+    LossError,
+    OutputError,
+    SlamObserverError,
+    UsageError,
+)
+from slam_observer_ros.common.findings import kept_warnings
 from slam_observer_ros.estimator.event_warnings import listed
-from slam_observer_ros.recordings.opening import sha256_of
-from slam_observer_ros.runs.accuracy import ACCURACY_ROWS, figure_text
-from slam_observer_ros.runs.input_health import list_dropped
-from slam_observer_ros.runs.metrics import TrajectoryErrors
-from slam_observer_ros.runs.reported_run import Replay, Sighting
+from slam_observer_ros.mapping.map_file import map_files, write_map
+from slam_observer_ros.recordings.opening import files_of, sha256_of
+from slam_observer_ros.recordings.trajectory import write_tum
+from slam_observer_ros.report.page import write_report
+from slam_observer_ros.report.summary import as_json, identity, summary_rows
+from slam_observer_ros.runs.result import Result, Sighting
+from slam_observer_ros.runs.run import result_of
 from slam_observer_ros.settings.node_settings import InputSettings
-from slam_observer_ros.settings.parameter_table import changed_names
+
+logger = logging.getLogger(__name__)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +60,38 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='.mcap, .db3 or ROS 1 .bag file, or rosbag2 directory',
     )
     add_run_options(parser)
-    add_output_options(parser)
+    outputs = parser.add_argument_group('outputs')
+    outputs.add_argument(
+        '--tum',
+        type=named_path,
+        metavar='FILE',
+        help='trajectory, as evo reads it, at most 20 poses a second',
+    )
+    outputs.add_argument('--map', type=named_path, metavar='FILE', help='landmarks, as YAML')
+    outputs.add_argument(
+        '--report',
+        type=named_path,
+        metavar='OUT.html',
+        help='one page for any browser, without a network: map, errors, residuals, consistency '
+        'and calibration over time, whose figures it saves as PNG or SVG',
+    )
+    outputs.add_argument(
+        '--mcap',
+        type=recording_path,
+        metavar='OUT.mcap',
+        help='the estimate as the node would have published it, for Foxglove and others',
+    )
+    outputs.add_argument(
+        '--with-inputs', action='store_true', help='--mcap has the messages that came in, too'
+    )
+    outputs.add_argument(
+        '--explain',
+        type=int,
+        metavar='ID',
+        help='print the life of a landmark, too: when it was new, the residual of each '
+        'observation, and why points of it were not used',
+    )
+    outputs.add_argument('--json', action='store_true', help='print one JSON object')
     parser.add_argument(
         '--strict',
         action='store_true',
@@ -60,41 +104,61 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Replay a recording, and write what was asked for."""
+    """Replay a recording; write and print all that can be, and only then say what could not be."""
     with kept_warnings() as warnings:
         given = read_given(args)
-        request = read_request(args, given, args.recording)
-        check_files(args, given.file)
+        request = replace(
+            read_request(args, given, args.recording),
+            keeps_poses=args.tum is not None,
+            keeps_nis=args.json,
+            keeps_run=args.report is not None or args.explain is not None,
+            keeps_map=args.map is not None,
+            mcap=args.mcap,
+            with_inputs=args.with_inputs,
+            overwrite=args.force,
+        )
+        _check_files(args, given.file)
         warn_of_unused(args, given)
-        outcome, map_frame = replayed(replace(request, records=records_of(args)))
-    _write_and_print(args, with_logged(outcome, warnings), map_frame)
-
-
-def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
-    """Write and print all that can be, and only then say what could not be written."""
-    rows = summary_rows(outcome)
-    life = [] if args.explain is None else outcome.shown.life(args.explain)
-    written, errors = write_files(args, outcome, map_frame, rows)
+        result = result_of(request, lambda events, n: show_progress(events, 'replaying', n))
+    result = replace(result, logged=warnings)
+    title = args.recording.name
+    rows, life = summary_rows(result), [] if args.explain is None else result.life(args.explain)
+    outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
+        ('trajectory', args.tum, lambda path: write_tum(result.trajectory, path)),
+        ('map', args.map, lambda path: _write_map(result, path)),
+        (
+            'report',
+            args.report,
+            lambda path: write_report(path, result, title, rows),
+        ),
+    )
+    written = {} if args.mcap is None else {'recording': str(args.mcap)}
+    errors: list[str] = []
+    for name, path, write in outputs:
+        if path is not None:
+            try:
+                write(path)
+                written[name] = str(path)
+            except (SlamObserverError, OSError) as error:
+                errors.append(str(error))
     if args.json:
-        sha256 = sha256_of(args.recording)
-        figures = identity(args.recording, sha256, outcome) | as_json(outcome)
+        figures = identity(args.recording, sha256_of(args.recording), result) | as_json(result)
         if args.explain is not None:
             figures['landmark'] = {'id': args.explain, 'life': [asdict(line) for line in life]}
         print_json(figures)
     else:
-        rows |= {name: str(path) for name, path in written.items()}
-        print_table(str(args.recording), rows)
+        print_table(str(args.recording), rows | written)
         if life:
             _print_life(args.explain, life)
     if errors:
         raise OutputError('; '.join(errors))
     if args.explain is not None and not life:
-        seen = listed(outcome.shown.seen_ids)
+        seen = listed(result.seen_ids)
         raise UsageError(f'--explain: no point had the id {args.explain}; there are {seen}')
-    if args.strict and any(outcome.lost.values()):
+    if args.strict and any(result.lost.values()):
         raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')
-    if args.strict and outcome.unused_input:
-        raise LossError(f'{args.recording}: --strict does not allow this: {outcome.unused_input}')
+    if args.strict and result.unused_input:
+        raise LossError(f'{args.recording}: --strict does not allow this: {result.unused_input}')
 
 
 def _print_life(landmark_id: int, life: Sequence[Sighting]) -> None:
@@ -107,158 +171,32 @@ def _print_life(landmark_id: int, life: Sequence[Sighting]) -> None:
     print_columns(f'landmark {landmark_id}', ('time, s', 'residual, σ', 'm'), lines)
 
 
-NEARLY_ALL = 0.99
-"""Share of the trajectory that the truth covers, up to which it is printed."""
-
-LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported', 'doubled')
-"""What may happen to landmarks of the map; counted under these names."""
-
-
-def identity(recording: Path, sha256: str, outcome: ReplayOutcome) -> dict[str, object]:
-    """Return what was replayed, by what, as ``--json`` has it first."""
-    settings = outcome.result.estimator.settings
-    return {
-        'recording': str(recording),
-        'recording_sha256': sha256,
-        'version': __version__,
-        'settings': {name: getattr(settings, name) for name in changed_names(settings)},
-        'warnings': list(outcome.warnings),
-    }
+def _check_files(args: argparse.Namespace, config: Path | None) -> None:
+    """Refuse outputs that are in the way of what is there; --map may update the map loaded."""
+    if args.with_inputs and args.mcap is None:
+        raise UsageError('--with-inputs is for --mcap')
+    read = {f'the recording {args.recording}': files_of(args.recording)}
+    if config is not None:
+        read['the file of --config'] = [config]
+    loaded = {} if args.load_map is None else {'the file of --load-map': map_files(args.load_map)}
+    files = {'--tum': args.tum, '--report': args.report, '--mcap': args.mcap}
+    check_inputs_are_kept(files, read | loaded)
+    check_inputs_are_kept({'--map': args.map}, read)
+    check_outputs([args.map, *files.values()], args.force)
 
 
-def as_json(outcome: ReplayOutcome) -> dict[str, object]:
-    """Return the figures as ``--json`` prints them; null is what was not measured."""
-    estimator, accuracy = outcome.result.estimator, outcome.accuracy
-    errors, after = accuracy.pose_errors, outcome.smoothed_accuracy
-    selected = outcome.selected
-    return {
-        'velocity_topic': selected.velocity.name,
-        'landmarks_topic': selected.landmarks.name,
-        'imu_topic': None if selected.imu is None else selected.imu.name,
-        'gains': estimator.settings.gains,
-        'events': outcome.events,
-        'duration_s': outcome.duration_s,
-        'seconds': outcome.result.seconds,
-        'landmarks': len(estimator.landmark_ids),
-        'dropped': outcome.dropped,
-        'lost': outcome.lost,
-        'findings': [finding.as_json() for finding in outcome.findings],
-        'used': dict(estimator.counts),
-        'calibration': {part.name: asdict(part) for part in estimator.calibration},
-        'motion_factors': {part.name: asdict(part) for part in estimator.motion_factors},
-        'map': estimator.map_name or None,
-        'localised_after_s': outcome.localised_after_s,
-        'truth_covered': outcome.truth_covered,
-        'ate_rmse_m': _ate_rmse_m(errors),
-        'unaligned_rmse_m': outcome.unaligned_rmse_m,
-        'rotation_rmse_rad': None if errors is None else errors.rotation_rmse_rad,
-        'heading_rmse_rad': None if errors is None else errors.heading_rmse_rad,
-        'landmark_rmse_m': accuracy.landmark_rmse_m,
-        'configuration_rmse_m': accuracy.configuration_rmse_m,
-        'anees': accuracy.anees,
-        'configuration_anees': accuracy.configuration_anees,
-        'nis': None if outcome.recorder is None else outcome.recorder.mean_nis,
-        'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
-        'unsmoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.online_errors),
-        'smoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.pose_errors),
-        'smoothed_landmark_rmse_m': None if after is None else after.landmark_rmse_m,
-        'smoothed_slips': None if outcome.smoothed is None else outcome.smoothed.slips,
-    }
-
-
-def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
-    return None if errors is None else errors.ate_rmse_m
-
-
-def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
-    """Return the figures as text, by their names."""
-    selected = outcome.selected
-    estimator = outcome.result.estimator
-    note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
-    rows = {'used': outcome.unused_input} if outcome.unused_input else {}
-    rows |= {
-        'velocity topic': str(selected.velocity),
-        'landmarks topic': f'{selected.landmarks}{note}',
-        **({} if selected.imu is None else {'Imu topic': str(selected.imu)}),
-        'events': f'{outcome.events} over {outcome.duration_s:.1f} s',
-        'estimator': f'{estimator.settings.gains} gains, '
-        f'{outcome.result.seconds:.2f} s of CPU time',
-        'landmarks': _landmarks_text(len(estimator.landmark_ids), estimator.counts),
-        'observed points': _points_text(estimator.counts),
-        'dropped': list_dropped(outcome.dropped),
-    }
-    if outcome.loss or outcome.lost['malformed']:
-        rows['lost'] = _loss_text(outcome)
-    if slips := estimator.counts['slip']:
-        rows['slips'] = f'{slips} × the robot was not where odometry had it'
-        if outcome.smoothed is not None:
-            rows['slips'] += f'; all that was seen confirms {outcome.smoothed.slips}'
-    if unexpected := estimator.counts['unexpected_place']:
-        rows['unexpected places'] = f'{unexpected} × nothing seen was where the map has it'
-    if outcome.localised_after_s is not None:
-        rows['pose in the map'] = _localisation_text(outcome.result, outcome.localised_after_s)
-    rows |= {part.name: str(part) for part in estimator.calibration}
-    rows |= {f'noise of {part.name}': str(part) for part in estimator.motion_factors}
-    return rows | _accuracy_rows(outcome)
-
-
-def _loss_text(outcome: ReplayOutcome) -> str:
-    parts = []
-    if outcome.loss:
-        parts.append(str(outcome.loss))
-    if malformed := outcome.lost['malformed']:
-        parts.append(f'{malformed} malformed messages')
-    return ', '.join(parts)
-
-
-def _localisation_text(result: Replay, localised_after_s: float) -> str:
-    name = f' in {result.estimator.map_name}' if result.estimator.map_name else ''
-    found = f'found after {localised_after_s:.1f} s{name}, where the trajectory begins'
-    if result.estimator.settings.set_initial_pose and localised_after_s == 0.0:
-        found = f'given at the start{name}'
-    lost = result.estimator.counts['lost']
-    return f'{found}; lost {lost} × and searched again' if lost else found
-
-
-def _landmarks_text(landmarks: int, counts: Counter[str]) -> str:
-    changed = {change: counts[f'{change}_landmark'] for change in LANDMARK_CHANGES}
-    changes = [f'{count} {change}' for change, count in changed.items() if count]
-    return ', '.join([str(landmarks), *changes])
-
-
-def _points_text(counts: Counter[str]) -> str:
-    """Say how many points were used, and why the others were not."""
-    parts = [f'{used_points(counts)} used']
-    parts += [
-        f'{counts[reason.value]} {reason.words} '
-        f'({100.0 * point_share(counts, reason.value):.1f} %)'
-        for reason in Reason
-        if counts[reason.value]
-    ]
-    return ', '.join(parts)
-
-
-def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
-    """Say of how much of the trajectory the figures are, if not of nearly all."""
-    share = outcome.truth_covered
-    if share is None or share > NEARLY_ALL:
-        return {}
-    return {'truth': f'covers {100.0 * share:.1f} % of the trajectory'}
-
-
-def _accuracy_rows(outcome: ReplayOutcome) -> dict[str, str]:
-    figures = as_json(outcome)
-    if figures['unsmoothed_ate_rmse_m'] == figures['ate_rmse_m']:  # all of it is smoothed
-        figures['unsmoothed_ate_rmse_m'] = None
-    rows = _covered_rows(outcome) | {
-        name: figure_text(key, figure, unit)
-        for key, (name, unit) in ACCURACY_ROWS.items()
-        if isinstance(figure := figures[key], float)
-    }
-    if rows:
-        return rows
-    has_truth = len(outcome.truth.stamps_ns) > 0 or outcome.truth.landmarks is not None
-    why = 'the truth fits nothing estimated'
-    if not has_truth:
-        why = 'the recording holds no truth to compare with'
-    return {'accuracy': f'not known: {why}'}
+def _write_map(result: Result, path: Path) -> None:
+    estimator = result.run.estimator
+    landmark_map = replace(estimator.landmark_map, frame_id=result.map_frame)
+    moving = len(estimator.landmark_ids) - len(landmark_map.ids)
+    if moving:
+        logger.warning('%d landmarks that move are left out of the map.', moving)
+    if result.smoothed is not None:
+        smoothed = result.smoothed.estimate
+        # The covariances stay: what the filter knows of the map in the end is smoothed, too.
+        landmark_map = replace(
+            landmark_map,
+            world_points=smoothed.world_points,
+            orientations=None if landmark_map.orientations is None else smoothed.orientations,
+        )
+    write_map(path, landmark_map, estimator.settings)

@@ -6,24 +6,28 @@ The simulation goes through the estimator, and shows how fast its Lyapunov funct
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
+import os
 from pathlib import Path
 
 import numpy as np
 
 from slam_observer_ros.cli.console import print_json, print_table, show_progress
-from slam_observer_ros.cli.options import add_settings_options, read_given, settings_of, value_of
-from slam_observer_ros.cli.outputs import (
+from slam_observer_ros.cli.options import (
     add_force_option,
-    add_result_options,
+    add_settings_options,
+    check_directory,
     check_outputs,
-    check_plots,
-    filled_directory,
+    named_path,
+    read_given,
     recording_path,
+    settings_of,
+    value_of,
 )
-from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.errors import EvaluationError, OutputError, UsageError
+from slam_observer_ros.common.files import destination, unfinished_directory
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
@@ -32,7 +36,7 @@ from slam_observer_ros.filter.observer import lyapunov
 from slam_observer_ros.recordings.trajectory import PoseTruth, Trajectory
 from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.metrics import Decay, fit_decay
-from slam_observer_ros.runs.sampling import PoseSamples
+from slam_observer_ros.runs.recorders import PoseSamples
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 from slam_observer_ros.simulation import Scenario, SimulatedEvent, Simulation
@@ -70,53 +74,41 @@ class SimulatedRun:
 def run_simulation(
     simulation: Simulation, events: Iterable[SimulatedEvent], settings: Settings
 ) -> SimulatedRun:
-    """Run events, as a simulation delivers them, through an estimator with these settings."""
-    run = _RunningSimulation(simulation, settings)
+    """Run events, as a simulation delivers them, through an estimator with these settings.
+
+    Of each update L is kept and, at most 20 times a second, the configuration.
+    """
+    levels: dict[int, float] = {}
+    samples, landmark_tracks = PoseSamples(), list[FloatArray]()
+
+    def note_update(update: Update) -> None:
+        if len(update.ids):
+            levels[update.stamp_ns] = update.lyapunov
+        stamps_ns = np.array([update.stamp_ns])
+        if samples.due(stamps_ns):
+            samples.add(stamps_ns, update.pose[None])
+            points = np.full((len(simulation.landmark_ids), 3), np.nan)
+            points[estimator.landmark_ids] = estimator.world_points
+            landmark_tracks.append(points)
+
+    estimator = Estimator(settings, on_update=note_update)
     for event in events:
         if not isinstance(event, PoseTruth):
-            run.estimator.add(event)
-    run.estimator.flush()
-    return run.result()
-
-
-class _RunningSimulation:
-    """Keeps L of every update and, at most 20 times a second, the configuration."""
-
-    def __init__(self, simulation: Simulation, settings: Settings) -> None:
-        self.estimator = Estimator(settings, on_update=self._on_update)
-        self._simulation = simulation
-        self._lyapunov: dict[int, float] = {}
-        self._samples = PoseSamples()
-        self._landmark_tracks: list[FloatArray] = []
-
-    def _on_update(self, update: Update) -> None:
-        if len(update.ids):
-            self._lyapunov[update.stamp_ns] = update.lyapunov
-        stamps_ns = np.array([update.stamp_ns])
-        if not self._samples.due(stamps_ns):
-            return
-        self._samples.add(stamps_ns, update.pose[None])
-        points = np.full((len(self._simulation.landmark_ids), 3), np.nan)
-        points[self.estimator.landmark_ids] = self.estimator.world_points
-        self._landmark_tracks.append(points)
-
-    def result(self) -> SimulatedRun:
-        estimate = self._samples.trajectory
-        times_s = to_s(np.array(list(self._lyapunov)) - self._simulation.start_ns)
-        levels = np.array(list(self._lyapunov.values()))
-        return SimulatedRun(
-            times_s,
-            levels,
-            fit_decay(times_s, levels, ROUNDING_MARGIN * self._rounding()),
-            estimate,
-            Trajectory(estimate.stamps_ns, self._simulation.pose(estimate.stamps_ns)),
-            np.array(self._landmark_tracks),
-        )
-
-    def _rounding(self) -> float:
-        """Return L of residuals that are the rounding of the landmarks' coordinates."""
-        rounding = self.estimator.world_points * np.finfo(np.float64).eps
-        return lyapunov(self.estimator.settings.gain_k, rounding)
+            estimator.add(event)
+    estimator.flush()
+    estimate, values = samples.trajectory, np.array(list(levels.values()))
+    times_s = to_s(np.array(list(levels)) - simulation.start_ns)
+    # L of residuals that are the rounding of the landmarks' coordinates
+    rounding = estimator.world_points * np.finfo(np.float64).eps
+    floor = ROUNDING_MARGIN * lyapunov(estimator.settings.gain_k, rounding)
+    return SimulatedRun(
+        times_s,
+        values,
+        fit_decay(times_s, values, floor),
+        estimate,
+        Trajectory(estimate.stamps_ns, simulation.pose(estimate.stamps_ns)),
+        np.array(landmark_tracks),
+    )
 
 
 START_NS = 1_000_000_000
@@ -154,17 +146,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar='S',
         help='seconds from one velocity and observation to the next (default 0.02)',
     )
-    _add_scenario_options(parser)
-    parser.add_argument(
-        '--output', type=recording_path, metavar='OUT.mcap', help='write a recording'
-    )
-    add_result_options(parser, FIGURES)
-    add_force_option(parser)
-    add_settings_options(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
     rows = {row.name: row for row in table(Scenario)}
     for option, name in _SCENARIO_OPTIONS.items():
         row = rows[name]
@@ -178,6 +159,25 @@ def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
             metavar='N' if isinstance(row.default, int) else 'M',
             help=f'{text}{unit} (default {row.default})',
         )
+    parser.add_argument(
+        '--output', type=recording_path, metavar='OUT.mcap', help='write a recording'
+    )
+    parser.add_argument(
+        '--plot',
+        type=named_path,
+        metavar='DIR',
+        help=f'draw the figures {", ".join(FIGURES)}',
+    )
+    parser.add_argument(
+        '--plot-format',
+        choices=('png', 'svg', 'pdf'),
+        default='png',
+        help='what the figures are written as (default png)',
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    add_force_option(parser)
+    add_settings_options(parser)
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -192,18 +192,48 @@ def run(args: argparse.Namespace) -> None:
         max_innovation_time=max(args.step, Settings().max_innovation_time),
     )
     check_outputs([args.output], args.force)
-    check_plots(args, FIGURES, [args.output])
+    figures = {name: f'{name}.{args.plot_format}' for name in FIGURES}
+    if args.plot is not None:
+        check_directory(args.plot)
+        written = {os.path.realpath(args.plot / name) for name in ('', *figures.values())}
+        if args.output is not None and os.path.realpath(args.output) in written:
+            raise UsageError(f'{args.output} is named for two outputs')
+        if args.plot.is_dir():
+            check_outputs([args.plot / name for name in figures.values()], args.force)
     simulation = Simulation(scenario, START_NS)
     result = run_simulation(simulation, _events(simulation, 'simulating'), settings)
     if args.output is not None:
-        _record(simulation, args.output, args.force)
+        start_ns = simulation.start_ns
+        with RecordingWriter(args.output, overwrite=args.force) as writer:
+            writer.write_landmarks(start_ns, simulation.landmark_truth(start_ns))
+            for event in _events(simulation, 'recording'):
+                writer.write_event(event)
     if args.plot is not None:
-        with filled_directory(args.plot) as unfinished:
-            _draw(simulation, result, unfinished, args.plot_format)
+        _draw(simulation, result, args.plot, figures)
     if args.json:
-        print_json(_as_json(args, result))
-    else:
-        _print_summary(args, result)
+        print_json(
+            {
+                'time_s': result.times_s.tolist(),
+                'log10_lyapunov': result.log10_lyapunov.tolist(),
+                'slope_per_s': None if result.decay is None else result.decay.slope_per_s,
+                'step_s': args.step,
+            }
+        )
+        return
+    rows = {
+        'simulated': f'{args.duration:g} s in steps of {args.step:g} s',
+        'landmarks': str(result.landmark_tracks.shape[1]),
+        'log10 L, first': f'{result.log10_lyapunov[0]:.2f}',
+        'log10 L, last': f'{result.log10_lyapunov[-1]:.2f}',
+        'slope of log10 L': 'none: too few values of L that are more than rounding'
+        if result.decay is None
+        else f'{result.decay.slope_per_s:.4f} per second after the transient',
+    }
+    if args.output is not None:
+        rows['recording'] = str(args.output)
+    if args.plot is not None:
+        rows['figures'] = str(args.plot)
+    print_table('Simulation', rows)
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
@@ -231,55 +261,32 @@ def _events(simulation: Simulation, description: str) -> Iterator[SimulatedEvent
     return show_progress(events, description, total)
 
 
-def _record(simulation: Simulation, path: Path, force: bool) -> None:
-    start_ns = simulation.start_ns
-    with RecordingWriter(path, overwrite=force) as writer:
-        writer.write_landmarks(start_ns, simulation.landmark_truth(start_ns))
-        for event in _events(simulation, 'recording'):
-            writer.write_event(event)
+def _draw(
+    simulation: Simulation, result: SimulatedRun, directory: Path, figures: Mapping[str, str]
+) -> None:
+    """Draw the figures, files by name, which go to a directory when all are written.
 
-
-def _draw(simulation: Simulation, result: SimulatedRun, directory: Path, suffix: str) -> None:
+    Raises an OutputError if that fails.
+    """
     # matplotlib takes longer to import than the simulation
-    from slam_observer_ros.runs.figures import (
-        plot_configuration,
-        plot_lyapunov,
-    )
+    from slam_observer_ros.runs.figures import plot_configuration, plot_lyapunov
 
     # Where L is zero nothing is drawn, rather than the floor.
     log10_lyapunov = np.where(result.lyapunov > 0.0, result.log10_lyapunov, -np.inf)
-    plot_lyapunov(directory / f'lyapunov.{suffix}', result.times_s, log10_lyapunov, result.decay)
-    plot_configuration(
-        directory / f'configuration.{suffix}',
-        result.estimate,
-        result.truth,
-        result.landmark_tracks,
-        simulation.world_points(simulation.start_ns),
-    )
-
-
-def _as_json(args: argparse.Namespace, result: SimulatedRun) -> dict[str, object]:
-    return {
-        'time_s': result.times_s.tolist(),
-        'log10_lyapunov': result.log10_lyapunov.tolist(),
-        'slope_per_s': None if result.decay is None else result.decay.slope_per_s,
-        'step_s': args.step,
-    }
-
-
-def _print_summary(args: argparse.Namespace, result: SimulatedRun) -> None:
-    rows = {
-        'simulated': f'{args.duration:g} s in steps of {args.step:g} s',
-        'landmarks': str(result.landmark_tracks.shape[1]),
-        'log10 L, first': f'{result.log10_lyapunov[0]:.2f}',
-        'log10 L, last': f'{result.log10_lyapunov[-1]:.2f}',
-        'slope of log10 L': 'none: too few values of L that are more than rounding'
-        if result.decay is None
-        else f'{result.decay.slope_per_s:.4f} per second after the transient',
-    }
-    rows |= {
-        name: str(path)
-        for name, path in (('recording', args.output), ('figures', args.plot))
-        if path is not None
-    }
-    print_table('Simulation', rows)
+    tracks, points = result.landmark_tracks, simulation.world_points(simulation.start_ns)
+    try:
+        with unfinished_directory(directory if directory.is_dir() else directory.parent) as made:
+            try:
+                plot_lyapunov(
+                    made / figures['lyapunov'], result.times_s, log10_lyapunov, result.decay
+                )
+                path = made / figures['configuration']
+                plot_configuration(path, result.estimate, result.truth, tracks, points)
+            except EvaluationError as error:  # which names a directory that is gone then
+                raise OutputError(str(error).replace(str(made), str(directory))) from error
+            directory.mkdir(exist_ok=True)
+            for file in sorted(made.iterdir()):
+                file.replace(destination(directory / file.name))
+    except OSError as error:
+        reason = error.strerror or error  # its whole text names a directory that is gone by now
+        raise OutputError(f"can't write figures to {directory}: {reason}") from error

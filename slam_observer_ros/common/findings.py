@@ -5,9 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from enum import IntEnum
+import logging
+import threading
 
 
 class Level(IntEnum):
@@ -721,6 +724,99 @@ def found(kind: str, /, **figures: object) -> Finding:
 def fault(kind: str, /, **figures: object) -> str:
     """Return a fault of a node in words, with its figures."""
     return FAULTS[kind].format(**figures)
+
+
+MISTAKES = frozenset({
+    'no_turning', 'points_in_optical_axes', 'points_mirrored', 'points_backwards',
+    'points_in_millimetres', 'tag_size', 'turning_in_degrees', 'speed_in_kmh',
+    'turning_negated', 'driving_negated',
+})  # fmt: skip
+"""Kinds of finding that name a mistake of the set-up."""
+
+OF_ODOMETRY = frozenset({
+    'late_odometry', 'implausible_calibration', 'noisy_odometry', 'axis_noise', 'motion_noise',
+    'small_noise',
+})  # fmt: skip
+"""Symptoms that speak of the delay and the noise of the odometry."""
+
+_OF_POSE = frozenset({
+    'unknown_pose', 'no_place', 'other_hall', 'other_ids', 'lost_pose', 'contradicted_pose',
+    'diverged',
+})  # fmt: skip
+
+SYMPTOMS = OF_ODOMETRY | _OF_POSE | {
+    'rejected_points', 'left_out_points', 'unmapped_points', 'drive_a_curve', 'wrong_pose',
+    'not_relinearised', 'slip', 'unexpected_place', 'moved_landmark', 'many_moved',
+    'carried_landmark', 'mounting', 'range_scale', 'depth_for_range', 'point_noise',
+    'large_noise', 'overconfident_pose', 'error_growth',
+}  # fmt: skip
+"""Findings that a mistake of the set-up may cause, and whose remedies would then be untrue."""
+
+EXPLAINED: Mapping[str, frozenset[str]] = {
+    **dict.fromkeys(MISTAKES, SYMPTOMS | {'rare_velocity'}),
+    # Where the robot is must be known, whatever the reason.
+    'several_publishers': (SYMPTOMS | MISTAKES | {'rare_velocity'}) - _OF_POSE,
+    'rare_velocity': OF_ODOMETRY,
+}
+"""By the kinds of causes: which findings they explain, whose remedies would be untrue."""
+
+ODOMETRY_CAUSES = frozenset(EXPLAINED) - MISTAKES
+"""Causes while which nothing can be learnt of the odometry."""
+
+SUSPICIOUS = SYMPTOMS - {'large_noise', 'error_growth', 'axis_noise', 'left_out_points'}
+"""Symptoms that are reason to look for a mistake."""
+
+
+def explained(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings without those that another one of them explains."""
+    findings = list(findings)
+    known = {each.kind for each in findings}
+    # A symptom explains nothing in its turn.
+    causes = known.difference(*(EXPLAINED.get(kind, ()) for kind in known))
+    symptoms = {kind for cause in causes for kind in EXPLAINED.get(cause, ())}
+    return [each for each in findings if each.kind not in symptoms]
+
+
+class _Keeper(logging.Handler):
+    """Keeps the warnings: findings, and others as text."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.warnings: list[Finding | str] = []
+        self._thread = threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one record, unless another thread's run gave it."""
+        if record.thread != self._thread:
+            return
+        first = record.args[0] if isinstance(record.args, tuple) and record.args else None
+        text = ' '.join(record.getMessage().split())
+        self.warnings.append(first if isinstance(first, Finding) else text)
+
+
+_LOGGER = logging.getLogger('slam_observer_ros')
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[Finding | str]]:
+    """Give a list that the package's warnings are added to, beside being shown."""
+    keeper = _Keeper()
+    _LOGGER.addHandler(keeper)
+    try:
+        yield keeper.warnings
+    finally:
+        _LOGGER.removeHandler(keeper)
+
+
+@contextmanager
+def muted_warnings() -> Iterator[None]:
+    """Show none of the package's warnings meanwhile."""
+    level = _LOGGER.level
+    _LOGGER.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        _LOGGER.setLevel(level)
 
 
 NAMED = 3

@@ -11,7 +11,15 @@ import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Bool
 
-from slam_observer_ros.common.findings import Finding, in_brief, Level, worst_first
+from slam_observer_ros.common.findings import (
+    explained,
+    Finding,
+    in_brief,
+    Level,
+    ODOMETRY_CAUSES,
+    SUSPICIOUS,
+    worst_first,
+)
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
@@ -21,16 +29,16 @@ from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.input_topic import InputTopic
 from slam_observer_ros.nodes.ros_node import GuardedNode, LATCHED_QOS, ThrottledLog
-from slam_observer_ros.runs.corrections import driven_s, explained, ODOMETRY_CAUSES, SUSPICIOUS
-from slam_observer_ros.runs.health import estimator_values, of_all_learnt, of_fit
-from slam_observer_ros.runs.live_health import (
-    deviations,
+from slam_observer_ros.runs.health import (
+    estimator_values,
     InputNumbers,
-    localisation,
+    of_all_learnt,
+    of_fit,
     of_node,
     Progress,
 )
-from slam_observer_ros.runs.mistakes import Search
+from slam_observer_ros.runs.live_health import deviations, localisation
+from slam_observer_ros.runs.mistakes import Drive, Search
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT_INNOVATIONS = (
@@ -183,7 +191,7 @@ class MistakeWatch:
         if self._search is not None or time.monotonic() < self._next_s:
             return
         is_suspicious = has_slipped or any(each.kind in SUSPICIOUS for each in findings)
-        if (is_suspicious or self.findings) and driven_s(self._events) > LEAST_DRIVEN_S:
+        if (is_suspicious or self.findings) and Drive(self._events).driven_s > LEAST_DRIVEN_S:
             maps = self._estimator.loaded_maps
             self._search = self._begin_search(
                 self._estimator.settings, list(self._events), maps or None

@@ -1,77 +1,39 @@
-"""One HTML file with style, script, plotting library and numbers inside."""
+"""One HTML file with style, script, plotting library and a run's numbers inside."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import resources
 import math
 from pathlib import Path
+import re
 import sys
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import json_text, OutputError
 from slam_observer_ros.common.files import unfinished_file
-from slam_observer_ros.common.findings import Finding
-from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.messages.estimate_messages import half_sights
 from slam_observer_ros.recordings.trajectory import interpolate
-from slam_observer_ros.report.curves import (
-    calibration,
-    consistency,
-    drops,
-    errors,
-    Json,
-    MAX_PATH,
-    rounded,
-    thinned,
+from slam_observer_ros.runs.metrics import (
+    average_nees_band,
+    CHI_SQUARE_95,
+    normalised_squared_errors,
 )
-from slam_observer_ros.runs.reported_run import ReportedRun
+from slam_observer_ros.runs.result import Result
 from slam_observer_ros.settings.parameter_table import changed_names, table
 
-_PARTS = {
-    'STYLE': 'report.css',
-    'PLOTTING_LIBRARY': 'plotly-basic.min.js',
-    'SCRIPT': 'report.js',
-}
+Json: TypeAlias = Any
+"""What json.dumps takes without NaN."""
 
+MAX_PATH = 4000
+"""Poses that are drawn, of the path and of its errors."""
 
-def write_report(
-    path: Path,
-    run: ReportedRun,
-    title: str,
-    figures: Mapping[str, str],
-    findings: Sequence[Finding],
-    warnings: Sequence[str],
-) -> None:
-    """Write the report of a run; it is whole or not there. Raises an OutputError if it can't.
-
-    ``figures`` are shown as a table; ``warnings`` are what no finding says.
-    """
-    text = {
-        'title': title,
-        'figures': [[name, value] for name, value in figures.items()],
-        'findings': [finding.as_json() | {'text': finding.text()} for finding in findings],
-        'warnings': list(warnings),
-    }
-    page = asset('page.html')
-    for mark, name in _PARTS.items():
-        page = page.replace(f'@{mark}@', asset(name), 1)
-    # In a script element only `<` could end it.
-    numbers = json_text(text | report_data(run), is_compact=True)
-    page = page.replace('@NUMBERS@', numbers.replace('<', '\\u003c'), 1)
-    try:
-        with unfinished_file(path) as file:
-            file.write(page)
-    except OSError as error:
-        raise OutputError(f"can't write {path}: {error.strerror}") from error
-
-
-def asset(name: str) -> str:
-    """Return the text of a file that pages are made of."""
-    return (resources.files(__package__) / 'assets' / name).read_text(encoding='utf-8')
-
+MAX_GROUPS, MIN_GROUP = 150, 10
+"""Points of the curve of NIS, and of how many observations each is the mean at least."""
 
 MAX_RESIDUALS = 6000
 MAX_ELLIPSES = 40_000
@@ -84,77 +46,130 @@ UPPER = np.triu_indices(3)
 """Entries of a covariance that the page has: xx, xy, xz, yy, yz, zz."""
 
 
-def report_data(run: ReportedRun) -> dict[str, Json]:
+def write_report(path: Path, result: Result, title: str, rows: Mapping[str, str]) -> None:
+    """Write the report of a run; it is whole or not there. Raises an OutputError if it can't.
+
+    ``rows`` are shown as a table, and all that was logged.
+    """
+    findings = [finding.as_json() | {'text': finding.text()} for finding in result.findings]
+    said = {finding['text'] for finding in findings}
+    text = {
+        'title': title,
+        'figures': [[name, value] for name, value in rows.items()],
+        'findings': findings,
+        'warnings': [warning for warning in result.warnings if warning not in said],
+    }
+    # In a script element only `<` could end it.
+    numbers = json_text(text | report_data(result), is_compact=True).replace('<', '\\u003c')
+    parts = {
+        'STYLE': asset('report.css'),
+        'PLOTTING_LIBRARY': asset('plotly-basic.min.js'),
+        'SCRIPT': asset('report.js'),
+        'NUMBERS': numbers,
+    }
+    write_page(path, 'page.html', parts)
+
+
+def write_page(path: Path, template: str, parts: Mapping[str, str]) -> None:
+    """Write a page with ``@NAME@`` replaced by the part of that name; OutputError if it fails."""
+    page = re.sub('@([A-Z_]+)@', lambda mark: parts[mark.group(1)], asset(template))
+    try:
+        with unfinished_file(path) as file:
+            file.write(page.encode(errors='replace').decode())  # names may be no Unicode
+    except OSError as error:
+        raise OutputError(f"can't write {path}: {error.strerror}") from error
+
+
+def asset(name: str) -> str:
+    """Return the text of a file that pages are made of."""
+    return (resources.files(__package__) / 'assets' / name).read_text(encoding='utf-8')
+
+
+def rounded(values: FloatArray, digits: int) -> list[Any]:
+    """Return nested lists, rounded, with None for what is not finite."""
+    numbers = np.round(np.asarray(values, dtype=np.float64), digits)
+    listed = numbers.astype(object)
+    listed[~np.isfinite(numbers)] = None
+    return list(listed.tolist())
+
+
+def thinned(count: int, most: int) -> slice:
+    """Return rows at equal steps, of ``count`` no more than ``most``."""
+    return slice(None, None, max(1, -(-count // most)))
+
+
+def report_data(result: Result) -> dict[str, Json]:
     """Return all that the page shows of a run."""
+    settings, smoothed = result.settings, result.smoothed
+    defaults = {row.name: row.default for row in table(type(settings))}
+    # Smoothed path and map are in the world of the estimate.
+    smoothed_data = None
+    if smoothed is not None:
+        positions = smoothed.trajectory.positions
+        smoothed_data = {
+            'xyz': rounded(positions[thinned(len(positions), MAX_PATH)].T, 3),
+            'points': rounded(smoothed.estimate.world_points.T, 3),
+        }
+    true_landmarks = None
+    if (truth := result.aligned_landmarks) is not None:
+        true_landmarks = {'ids': truth.ids.tolist(), 'xyz': rounded(truth.world_points.T, 3)}
+    # Messages dropped until each instant
+    reasons = sorted({reason for instant in result.instants for reason in instant.dropped})
     return {
-        'settings': _settings(run),
+        'settings': [
+            [name, str(getattr(settings, name)), str(defaults[name])]
+            for name in changed_names(settings)
+        ],
         'versions': [
             ['slam_observer_ros', __version__],
             ['Python', sys.version.split()[0]],
             ['numpy', np.__version__],
         ],
-        'is_flat': _is_flat(run),
-        'gaps': rounded(run.gaps_s, 2),
-        'path': _path(run),
-        'instants': _instants(run),
-        'smoothed': _smoothed(run),
-        'landmarks': _landmarks(run),
-        'true_landmarks': _true_landmarks(run),
-        'errors': errors(run),
-        'consistency': consistency(run),
-        'residuals': _residuals(run),
-        'outcomes': _outcomes(run),
-        'gate': run.settings.rejection_threshold,
-        'calibration': calibration(run),
-        'drops': drops(run),
+        'is_flat': _is_flat(result),
+        'gaps': rounded(result.gaps_s, 2),
+        'path': _path(result),
+        'instants': _instants(result),
+        'smoothed': smoothed_data,
+        'landmarks': _landmarks(result),
+        'true_landmarks': true_landmarks,
+        'errors': _errors(result),
+        'consistency': _consistency(result),
+        'residuals': _residuals(result),
+        'outcomes': _outcomes(result),
+        'gate': settings.rejection_threshold,
+        'calibration': [_calibration_curve(result, part.name) for part in result.calibration],
+        'drops': [
+            {'reason': reason, 'count': [each.dropped[reason] for each in result.instants]}
+            for reason in reasons
+        ],
     }
 
 
-def _settings(run: ReportedRun) -> list[Json]:
-    settings = run.settings
-    defaults = {row.name: row.default for row in table(type(settings))}
-    return [
-        [name, str(getattr(settings, name)), str(defaults[name])]
-        for name in changed_names(settings)
-    ]
-
-
-def _is_flat(run: ReportedRun) -> bool:
-    points = [run.trajectory.positions]
-    if run.instants:
-        points.append(run.instants[-1].world_points)
+def _is_flat(result: Result) -> bool:
+    points = [result.run.trajectory.positions]
+    if result.instants:
+        points.append(result.instants[-1].world_points)
     extent = np.ptp(np.concatenate(points), axis=0) if len(points[0]) else np.zeros(3)
     return bool(extent[2] <= FLAT * max(extent[0], extent[1]))
 
 
-def _path(run: ReportedRun) -> dict[str, Json]:
-    trajectory = run.trajectory
+def _path(result: Result) -> dict[str, Json]:
+    trajectory = result.run.trajectory
     some = thinned(len(trajectory), MAX_PATH)
     stamps_ns, positions = trajectory.stamps_ns[some], trajectory.positions[some]
-    path: dict[str, Json] = {
-        't': rounded(run.seconds(stamps_ns), 2),
-        'xyz': rounded(positions.T, 3),
-    }
-    if run.errors is not None:
-        true_poses, _ = interpolate(run.errors.aligned_truth, stamps_ns)
+    path = {'t': rounded(result.seconds(stamps_ns), 2), 'xyz': rounded(positions.T, 3)}
+    if result.errors is not None:
+        true_poses, _ = interpolate(result.errors.aligned_truth, stamps_ns)
         path['true_xyz'] = rounded(true_poses[:, :3, 3].T, 3)
         path['error_m'] = rounded(np.linalg.norm(positions - true_poses[:, :3, 3], axis=1), 3)
     return path
 
 
-def _smoothed(run: ReportedRun) -> Json:
-    """Return the smoothed path and map in the world of the estimate; None if not asked for."""
-    if run.smoothed is None or run.smoothed_points is None:
-        return None
-    positions = run.smoothed.positions[thinned(len(run.smoothed), MAX_PATH)]
-    return {'xyz': rounded(positions.T, 3), 'points': rounded(run.smoothed_points.T, 3)}
-
-
-def _instants(run: ReportedRun) -> dict[str, Json]:
+def _instants(result: Result) -> dict[str, Json]:
     """Return robot and map at instants, with the covariances of their positions."""
-    total = sum(len(instant.ids) for instant in run.instants)
-    some = run.instants[thinned(total, MAX_ELLIPSES)]
-    seconds = run.seconds(np.array([instant.stamp_ns for instant in some], dtype=np.int64))
+    total = sum(len(instant.ids) for instant in result.instants)
+    some = result.instants[thinned(total, MAX_ELLIPSES)]
+    seconds = result.seconds(np.array([instant.stamp_ns for instant in some], dtype=np.int64))
     poses = np.array([instant.pose for instant in some]).reshape(-1, 4, 4)
     halves = [
         (np.empty((0, 3)), np.empty((0, 3)))
@@ -162,21 +177,18 @@ def _instants(run: ReportedRun) -> dict[str, Json]:
         else half_sights(instant.seen, instant.ids, instant.world_points)
         for instant in some
     ]
+    of_poses = [instant.pose_covariance for instant in some]
     return {
         't': rounded(seconds, 2),
         'xyz': rounded(poses[:, :3, 3], 3),
         'ahead': rounded(poses[:, :3, 0], 3),
-        'robot': [_covariances(_position_covariance(instant.pose_covariance)) for instant in some],
+        'robot': [_covariances(None if P is None else P[None, 3:, 3:]) for P in of_poses],
         'ids': [instant.ids.tolist() for instant in some],
         'points': [rounded(instant.world_points.T, 3) for instant in some],
         'covariances': [_covariances(instant.landmark_covariances) for instant in some],
         'rings': [rounded(rings, 3) for rings, _ in halves],
         'rays': [rounded(ends, 3) for _, ends in halves],
     }
-
-
-def _position_covariance(pose_covariance: FloatArray | None) -> FloatArray | None:
-    return None if pose_covariance is None else pose_covariance[None, 3:, 3:]
 
 
 def _covariances(covariances: FloatArray | None) -> Json:
@@ -189,50 +201,35 @@ def _covariances(covariances: FloatArray | None) -> Json:
     ]
 
 
-def _true_landmarks(run: ReportedRun) -> Json:
-    truth = run.aligned_landmarks
-    if truth is None:
-        return None
-    return {'ids': truth.ids.tolist(), 'xyz': rounded(truth.world_points.T, 3)}
-
-
-def _landmarks(run: ReportedRun) -> list[Json]:
+def _landmarks(result: Result) -> list[Json]:
     """Return a row for each landmark of the map: what was seen of it, and how well it fits."""
-    if not run.instants:
+    if not result.instants:
         return []
-    innovations, last = run.innovations, run.instants[-1]
+    innovations, last = result.innovations, result.instants[-1]
     true_points = {}
-    if (truth := run.aligned_landmarks) is not None:
+    if (truth := result.aligned_landmarks) is not None:
         true_points = dict(zip(truth.ids.tolist(), truth.world_points, strict=True))
     rows: list[Json] = []
     for row, landmark_id in enumerate(last.ids.tolist()):
         of_it = innovations.ids == landmark_id
         used = of_it & (innovations.weights > 0.0)
-        true_point = true_points.get(landmark_id)
-        error_m = math.nan
-        if true_point is not None:
-            error_m = float(np.linalg.norm(last.world_points[row] - true_point))
-        deviation_m = math.nan
+        error_m = deviation_m = math.nan
+        if landmark_id in true_points:
+            error_m = float(np.linalg.norm(last.world_points[row] - true_points[landmark_id]))
         if last.landmark_covariances is not None:
             deviation_m = math.sqrt(max(np.trace(last.landmark_covariances[row]), 0.0))
+        counted = [
+            of_it,
+            of_it & ~used,
+            used & (innovations.weights < 1.0),
+            of_it & innovations.moved,
+        ]
+        fit = [_rms(innovations.residuals_m[used]), _rms(innovations.distances[used])]
         rows.append(
             [
                 landmark_id,
-                int(np.count_nonzero(of_it)),
-                int(np.count_nonzero(of_it & (innovations.weights == 0.0))),
-                int(np.count_nonzero(used & (innovations.weights < 1.0))),
-                int(np.count_nonzero(of_it & innovations.moved)),
-                *rounded(
-                    np.array(
-                        [
-                            _rms(innovations.residuals_m[used]),
-                            _rms(innovations.distances[used]),
-                            deviation_m,
-                            error_m,
-                        ]
-                    ),
-                    3,
-                ),
+                *(int(np.count_nonzero(each)) for each in counted),
+                *rounded(np.array([*fit, deviation_m, error_m]), 3),
             ]
         )
     return rows
@@ -242,12 +239,91 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
 
 
-def _residuals(run: ReportedRun) -> dict[str, Json]:
+def _errors(result: Result) -> dict[str, Json]:
+    """Return position errors and the half-axis of the stated 95 % ellipse, metres.
+
+    The heading errors are in degrees, after the alignment.
+    """
+    innovations, configuration = result.innovations, result.run.configuration
+    bounds_m = [
+        np.nan
+        if (P := instant.pose_covariance) is None
+        else np.sqrt(CHI_SQUARE_95 * max(np.linalg.eigvalsh(P[3:, 3:])[-1], 0.0))
+        for instant in result.instants
+    ]
+    lyapunov = np.where(innovations.lyapunov > 0.0, innovations.lyapunov, np.nan)
+    curves: dict[str, Json] = {
+        't': rounded(result.instants_s, 2),
+        'bound_m': rounded(np.array(bounds_m), 3),
+        'lyapunov_t': rounded(result.seconds(innovations.update_stamps_ns), 2),
+        'lyapunov': rounded(np.log10(lyapunov), 2),
+    }
+
+    def draw(name: str, unit: str, stamps_ns: IntArray, values: FloatArray) -> None:
+        some = thinned(len(stamps_ns), MAX_PATH)
+        curves[f'{name}_t'] = rounded(result.seconds(stamps_ns[some]), 2)
+        curves[f'{name}_{unit}'] = rounded(values[some], 3)
+
+    if (errors := result.errors) is not None:
+        draw('heading', 'deg', errors.estimate.stamps_ns, np.degrees(errors.errors[:, 2]))
+    if result.smoothed is not None and (errors := result.smoothed.pose_errors) is not None:
+        stamps_ns = errors.estimate.stamps_ns
+        draw('smoothed', 'm', stamps_ns, errors.distances_m)
+        draw('smoothed', 'heading_deg', stamps_ns, np.degrees(errors.errors[:, 2]))
+    if configuration.values_m:
+        values_m = np.array(configuration.values_m)
+        draw('configuration', 'm', np.array(configuration.stamps_ns), values_m)
+    if (anchored := result.anchored_errors()) is not None:
+        of_poses, rows = anchored
+        error_m = np.full(len(result.instants), np.nan)
+        error_m[rows] = np.linalg.norm(of_poses[:, 3:], axis=1)
+        curves['drift_m'] = rounded(error_m, 3)
+    return curves
+
+
+def _consistency(result: Result) -> dict[str, Json]:
+    """Return NEES of the pose and NIS, each per degree of freedom, with their 95 % bands."""
+    curves: dict[str, Json] = {}
+    innovations = result.innovations
+    known = np.flatnonzero(innovations.degrees_of_freedom > 0)
+    if len(known):
+        group = max(MIN_GROUP, -(-len(known) // MAX_GROUPS))
+        starts = np.arange(0, len(known), group)
+        degrees = np.add.reduceat(innovations.degrees_of_freedom[known], starts)
+        nis = np.add.reduceat(innovations.nis[known], starts) / degrees
+        middles = np.minimum(starts + group // 2, len(known) - 1)
+        bands = np.array([average_nees_band(int(count), 1) for count in degrees])
+        curves |= {
+            'nis_t': rounded(result.seconds(innovations.update_stamps_ns[known[middles]]), 2),
+            'nis': rounded(nis, 3),
+            'nis_low': rounded(bands[:, 0], 3),
+            'nis_high': rounded(bands[:, 1], 3),
+            'nis_group': group,
+        }
+    of_poses, rows = result.anchored_errors() or (np.empty((0, 6)), np.empty(0, dtype=np.int64))
+    covariances = [result.instants[row].pose_covariance for row in rows.tolist()]
+    stated = [index for index, covariance in enumerate(covariances) if covariance is not None]
+    if not stated:
+        return curves
+    nees, degrees = normalised_squared_errors(
+        of_poses[stated], np.array([covariances[index] for index in stated])
+    )
+    usable = degrees > 0  # the first pose is exact
+    if not usable.any():
+        return curves
+    return curves | {
+        'nees_t': rounded(result.instants_s[rows[stated]][usable], 2),
+        'nees': rounded(nees[usable] / degrees[usable], 3),
+        'nees_band': rounded(np.array(average_nees_band(int(degrees[usable].max()), 1)), 3),
+    }
+
+
+def _residuals(result: Result) -> dict[str, Json]:
     """Return residuals in σ: of a great many the suspicious ones, and some of the others."""
-    innovations = run.innovations
+    innovations = result.innovations
     shown = _shown(innovations.weights, innovations.distances) | innovations.moved
     return {
-        't': rounded(run.seconds(innovations.stamps_ns[shown]), 2),
+        't': rounded(result.seconds(innovations.stamps_ns[shown]), 2),
         'id': innovations.ids[shown].tolist(),
         'sigma': rounded(innovations.distances[shown], 2),
         'm': rounded(innovations.residuals_m[shown], 3),
@@ -257,24 +333,37 @@ def _residuals(run: ReportedRun) -> dict[str, Json]:
     }
 
 
-def _outcomes(run: ReportedRun) -> dict[str, Json]:
+def _shown(weights: FloatArray, distances: FloatArray) -> BoolArray:
+    shown = np.ones(len(weights), dtype=np.bool_)
+    if len(weights) > MAX_RESIDUALS:
+        shown[:] = False
+        shown[thinned(len(weights), MAX_RESIDUALS // 2)] = True
+        suspicious = np.flatnonzero((weights < 1.0) | (distances > 3.0))
+        shown[suspicious[thinned(len(suspicious), MAX_RESIDUALS // 2)]] = True
+    return shown
+
+
+def _outcomes(result: Result) -> dict[str, Json]:
     """Return what became of landmarks, and why points were not used that have no residual."""
-    each = run.without_residual
+    each = result.without_residual
     each = each[thinned(len(each), MAX_RESIDUALS)]
     stamps_ns = np.array([one.stamp_ns for one in each], dtype=np.int64)
     return {
-        't': rounded(run.seconds(stamps_ns), 2),
+        't': rounded(result.seconds(stamps_ns), 2),
         'id': [one.landmark_id for one in each],
         'what': [one.what.words for one in each],
     }
 
 
-def _shown(weights: FloatArray, distances: FloatArray) -> BoolArray:
-    if len(weights) <= MAX_RESIDUALS:
-        return np.ones(len(weights), dtype=np.bool_)
-    suspicious = np.flatnonzero((weights < 1.0) | (distances > 3.0))
-    suspicious = suspicious[thinned(len(suspicious), MAX_RESIDUALS // 2)]
-    shown = np.zeros(len(weights), dtype=np.bool_)
-    shown[thinned(len(weights), MAX_RESIDUALS // 2)] = True
-    shown[suspicious] = True
-    return shown
+def _calibration_curve(result: Result, name: str) -> dict[str, Json]:
+    """Return what was estimated of a property over time, and its standard deviation."""
+    seconds, parts = result.calibration_over_time(name)
+    factor, unit = parts[-1].for_people
+    return {
+        'name': name,
+        'unit': unit,
+        'nominal': factor * parts[-1].nominal,
+        't': rounded(seconds, 2),
+        'value': rounded(factor * np.array([part.value for part in parts]), 5),
+        'deviation': rounded(factor * np.array([part.deviation for part in parts]), 5),
+    }

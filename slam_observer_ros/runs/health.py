@@ -1,20 +1,20 @@
 """The judge of health: what is wrong with an estimate, live and in a replay alike.
 
 What it finds are data (``common/findings.py``), which table, JSON, report, log and /diagnostics
-show. ``input_health.py`` judges what a recording holds, ``error_health.py`` its errors.
+show. ``run_health.py`` judges what only a whole run shows.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
-from typing import Any, Protocol, TypeAlias
+from typing import Any
 
 from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import IntArray
+from slam_observer_ros.common.types import is_automatic
 from slam_observer_ros.estimates import (
     Ambiguity,
     CalibrationEstimate,
@@ -24,11 +24,10 @@ from slam_observer_ros.estimates import (
     point_share,
     RangePower,
     Reason,
-    Update,
 )
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.lie.matrices import MAX_DEVIATION
 from slam_observer_ros.messages.outgoing import OutgoingMessages
-from slam_observer_ros.settings.estimator_settings import Settings
 
 MAX_REJECTED = 0.1
 """Share of the points beyond which they are more than a sensor's outliers."""
@@ -81,70 +80,21 @@ NOISELESS = 0.01
 
 MOUNTED = {
     'sensor_rotation': (
-        (
-            'further rolled to the right/further rolled to the left',
-            'further down/further up',
-            'further to the left/further to the right',
-        ),
-        ('roll', 'pitch', 'yaw'),
+        ('further rolled to the right/further rolled to the left', 'roll'),
+        ('further down/further up', 'pitch'),
+        ('further to the left/further to the right', 'yaw'),
     ),
     'sensor_translation': (
-        (
-            'further forward/further back',
-            'further to the left/further to the right',
-            'higher/lower',
-        ),
-        ('x', 'y', 'z'),
+        ('further forward/further back', 'x'),
+        ('further to the left/further to the right', 'y'),
+        ('higher/lower', 'z'),
     ),
 }
 """In words, by axis, how a sensor is mounted whose turn or shift is positive/negative."""
 
 
-Learnt: TypeAlias = tuple[Sequence[CalibrationEstimate], Sequence[MotionFactor]]
-"""Calibration and noise of the odometry."""
-
-
-class Diagnosed(Protocol):
-    """What is looked at of an :class:`.Estimator`."""
-
-    last_update: Update | None
-
-    @property
-    def counts(self) -> Counter[str]: ...  # noqa: D102 (as all below, of the estimator)
-    @property
-    def dropped(self) -> Counter[str]: ...  # noqa: D102
-    @property
-    def landmark_ids(self) -> IntArray: ...  # noqa: D102
-    @property
-    def settings(self) -> Settings: ...  # noqa: D102
-    @property
-    def ambiguity(self) -> Ambiguity | None: ...  # noqa: D102
-    @property
-    def waiting_landmarks(self) -> int: ...  # noqa: D102
-    @property
-    def calibration(self) -> Sequence[CalibrationEstimate]: ...  # noqa: D102
-    @property
-    def motion_factors(self) -> Sequence[MotionFactor]: ...  # noqa: D102
-    @property
-    def anchor_biases(self) -> Mapping[int, float]: ...  # noqa: D102
-    @property
-    def open_sides(self) -> Sequence[int]: ...  # noqa: D102
-    @property
-    def undisturbed(self) -> Learnt: ...  # noqa: D102
-    @property
-    def has_rare_velocities(self) -> bool: ...  # noqa: D102
-    @property
-    def velocity_period_s(self) -> float: ...  # noqa: D102
-    @property
-    def lyapunov(self) -> float: ...  # noqa: D102
-    @property
-    def stamp_ns(self) -> int | None: ...  # noqa: D102
-    @property
-    def velocity_is_stale(self) -> bool: ...  # noqa: D102
-
-
 def estimator_values(
-    estimator: Diagnosed, dropped: Counter[str], findings: Iterable[Finding]
+    estimator: Estimate, dropped: Counter[str], findings: Iterable[Finding]
 ) -> dict[str, str]:
     """Return what was used and dropped and why, map, calibration and noise, and what to do."""
     update = estimator.last_update
@@ -162,13 +112,13 @@ def estimator_values(
     return values
 
 
-def of_velocity(estimator: Diagnosed) -> list[Finding]:
+def of_velocity(estimator: Estimate) -> list[Finding]:
     """Judge whether velocities still come."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
     return [found('stale_velocity')] if stale else []
 
 
-def of_estimate(estimator: Diagnosed) -> list[Finding]:
+def of_estimate(estimator: Estimate) -> list[Finding]:
     """Judge what is estimated of velocities and sensors, live and after a whole run alike."""
     calibration, factors = estimator.undisturbed
     of_odometry = [*of_calibration(calibration), *of_noise(factors)]
@@ -178,7 +128,7 @@ def of_estimate(estimator: Diagnosed) -> list[Finding]:
     return [*of_odometry, *of_mounting(calibration), *half_points]
 
 
-def of_all_learnt(estimator: Diagnosed) -> list[Finding]:
+def of_all_learnt(estimator: Estimate) -> list[Finding]:
     """Judge the same, be it explained by a slip or the like: a mistake may explain both."""
     calibration = estimator.calibration
     of_noise_learnt = of_noise(estimator.motion_factors)
@@ -202,7 +152,7 @@ def of_half_points(biases: Mapping[int, float], open_sides: Sequence[int]) -> li
     return [*biased, found('side_undecided', ids=ids)]
 
 
-def of_map_without_ids(estimator: Diagnosed, ambiguity: Ambiguity | None) -> list[Finding]:
+def of_map_without_ids(estimator: Estimate, ambiguity: Ambiguity | None) -> list[Finding]:
     """Judge whether what was seen without ids makes one map, and makes one at all."""
     findings, known, waiting = [], len(estimator.landmark_ids), estimator.waiting_landmarks
     if ambiguity is not None:
@@ -225,55 +175,50 @@ def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
         if part.name == DELAY_NAME and abs(part.value - part.nominal) > notable_s:
             when = 'late' if part.value > 0.0 else 'early'
             return [found('late_odometry', delay_s=abs(part.value), when=when, set_to=part.value)]
-    return [_implausible(part) for part in parts if _times_off(part) > IMPLAUSIBLE]
-
-
-def _times_off(part: CalibrationEstimate) -> float:
-    return abs(part.value - part.nominal) / part.stated
-
-
-def _implausible(part: CalibrationEstimate) -> Finding:
-    factor, unit = part.for_people
-    return found(
-        'implausible_calibration',
-        name=part.name,
-        value=factor * part.value,
-        times=_times_off(part),
-        stated=factor * part.stated,
-        nominal=f'{factor * part.nominal:g} {unit}'.rstrip(),
-    )
+    findings = []
+    for part in parts:
+        factor, unit = part.for_people
+        times = abs(part.value - part.nominal) / part.stated
+        if times > IMPLAUSIBLE:
+            finding = found(
+                'implausible_calibration',
+                name=part.name,
+                value=factor * part.value,
+                times=times,
+                stated=factor * part.stated,
+                nominal=f'{factor * part.nominal:g} {unit}'.rstrip(),
+            )
+            findings.append(finding)
+    return findings
 
 
 def of_mounting(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
-    """Say what to set so that sensors are stated as they were found to be."""
-    return [finding for part in calibration if (finding := _mounting(part))]
+    """Say what to set so that sensors are stated as they were found to be.
 
-
-def _mounting(part: CalibrationEstimate) -> Finding | None:
-    """Judge one property of a sensor.
-
-    It is found where it is three standard deviations off, and those have become a third.
+    A property is found where it is three standard deviations off, and those have become a third.
     """
-    name, _, frame = part.name.partition('/')
-    off, sensor = part.value - part.nominal, frame or 'the sensor'
-    if abs(off) < 3.0 * part.deviation or 3.0 * part.deviation > part.stated:
-        return None
-    if name == 'range_scale':
-        return found('range_scale', sensor=sensor, found=part, value=part.value)
-    mounted, _, axis = name.rpartition('_')
-    if mounted not in MOUNTED:
-        return None
-    factor, unit = part.for_people
-    words, entries = MOUNTED[mounted]
-    number = 'xyz'.index(axis)
-    return found(
-        'mounting',
-        sensor=sensor,
-        off=f'{abs(factor * off):.2g} ± {factor * part.deviation:.2g} {unit}',
-        towards=words[number].split('/')[int(off < 0.0)],
-        amount=off,
-        entry=entries[number],
-    )
+    findings = []
+    for part in calibration:
+        name, _, frame = part.name.partition('/')
+        mounted, _, axis = name.rpartition('_')
+        off, sensor = part.value - part.nominal, frame or 'the sensor'
+        if abs(off) < 3.0 * part.deviation or 3.0 * part.deviation > part.stated:
+            continue
+        if name == 'range_scale':
+            findings.append(found(name, sensor=sensor, found=part, value=part.value))
+        elif mounted in MOUNTED:
+            factor, unit = part.for_people
+            words, entry = MOUNTED[mounted]['xyz'.index(axis)]
+            finding = found(
+                'mounting',
+                sensor=sensor,
+                off=f'{abs(factor * off):.2g} ± {factor * part.deviation:.2g} {unit}',
+                towards=words.split('/')[int(off < 0.0)],
+                amount=off,
+                entry=entry,
+            )
+            findings.append(finding)
+    return findings
 
 
 def of_ranges(power: RangePower | None, is_depth: bool) -> list[Finding]:
@@ -372,8 +317,97 @@ def of_map(counts: Counter[str], *, is_start_given: bool) -> Iterator[Finding]:
         yield found('unmapped_points', percent=100.0 * share, start=start)
 
 
+SILENT_S = 2.0
+"""An input without messages for this long is a warning."""
+
+MIN_POINTS = 50
+"""Points that it takes to say how large a share of them is rejected."""
+
+MANY_EMPTY = 200
+"""Messages without a landmark, that are no detector that waits for one."""
+
+MANY_UNUSED = 20
+"""Messages, none of which was used, that are no transient of the start."""
+
+USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
+"""Inputs, and what their messages are counted as when they are used."""
+
+
+@dataclass(frozen=True, slots=True)
+class InputNumbers:
+    """What a node knows of one of its inputs."""
+
+    name: str
+    topic: str
+    received: int
+    silent_s: float
+    problem: str  # why no message comes
+    doubt: Finding | None  # of publishers and content
+    unread: Finding | None  # what was wrong with those that were malformed since the last time
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What was counted since a node was judged last: in all, and of points lately."""
+
+    dropped: Counter[str]
+    counts: Counter[str]
+    unstamped: Counter[str]
+    lately: Counter[str]
+    is_paused: bool
+    has_seen: bool  # any landmark, ever
+
+
+def of_node(
+    estimator: Estimate, inputs: Sequence[InputNumbers], progress: Progress
+) -> list[Finding]:
+    """Judge where the robot is, what came, and what is estimated."""
+    findings = _of_place(estimator)
+    if progress.dropped and not progress.is_paused:
+        # What came while the node was paused or inactive was not to be used.
+        findings += [
+            found('unused_input', count=each.received, topic=each.topic)
+            for each in inputs
+            if each.name in USED_AS
+            and each.received >= MANY_UNUSED
+            and not estimator.counts[USED_AS[each.name]]
+        ]
+    findings += [
+        found('silent_input', topic=each.topic)
+        for each in inputs
+        if not each.problem and each.silent_s > SILENT_S
+    ]
+    if progress.is_paused:
+        findings.append(found('paused'))
+    elif total := progress.dropped.total():
+        (reason, _), *others = progress.dropped.most_common()
+        count = f'{total} message{"s" * (total != 1)}'
+        reasons = f'mostly {reason}' if others else reason
+        findings.append(found('dropped_messages', count=count, reasons=reasons))
+    said = [*(each.unread for each in inputs), *(each.doubt for each in inputs)]
+    findings += [finding for finding in said if finding is not None]
+    findings += of_stamps(progress.unstamped)
+    if not progress.has_seen and (observations := estimator.counts['observation']) >= MANY_EMPTY:
+        findings.append(found('empty_messages', count=observations))
+    findings += estimator.ids_at_two_places
+    findings += of_left_out(progress.counts, Level.WARNING)
+    if progress.lately['observed_point'] >= MIN_POINTS:
+        findings += of_rejections(progress.lately, 'seen lately ')
+    findings += of_velocity(estimator) + of_estimate(estimator)
+    return findings + of_map_without_ids(estimator, estimator.ambiguity)
+
+
+def _of_place(estimator: Estimate) -> list[Finding]:
+    if estimator.is_localised:
+        return []
+    findings, problem = [found('unknown_pose')], estimator.localisation_problem
+    # Landmarks that came without an id have one that was given here.
+    is_by_place = is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)
+    return [*findings, problem] if problem and is_by_place else findings
+
+
 def diagnostics(
-    messages: OutgoingMessages, stamp_ns: int, estimator: Diagnosed, hardware_id: str
+    messages: OutgoingMessages, stamp_ns: int, estimator: Estimate, hardware_id: str
 ) -> Any:
     """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
     findings = of_velocity(estimator) + of_estimate(estimator)

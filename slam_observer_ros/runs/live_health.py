@@ -5,9 +5,8 @@ Nodes hand over what they count and measure, and show what is found here.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 import math
 from statistics import median_low
 from typing import Any
@@ -16,105 +15,8 @@ import numpy as np
 
 from slam_observer_ros.common.findings import fault, Finding, found, Level
 from slam_observer_ros.common.stamps import is_of_1970, to_s
-from slam_observer_ros.common.types import is_automatic
 from slam_observer_ros.estimator.estimate import Estimate
-from slam_observer_ros.runs.health import (
-    of_estimate,
-    of_left_out,
-    of_map_without_ids,
-    of_rejections,
-    of_stamps,
-    of_velocity,
-)
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
-
-SILENT_S = 2.0
-"""An input without messages for this long is a warning."""
-
-MIN_POINTS = 50
-"""Points that it takes to say how large a share of them is rejected."""
-
-MANY_EMPTY = 200
-"""Messages without a landmark, that are no detector that waits for one."""
-
-MANY_UNUSED = 20
-"""Messages, none of which was used, that are no transient of the start."""
-
-USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
-"""Inputs, and what their messages are counted as when they are used."""
-
-
-@dataclass(frozen=True, slots=True)
-class InputNumbers:
-    """What a node knows of one of its inputs."""
-
-    name: str
-    topic: str
-    received: int
-    silent_s: float
-    problem: str  # why no message comes
-    doubt: Finding | None  # of publishers and content
-    unread: Finding | None  # what was wrong with those that were malformed since the last time
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """What was counted since a node was judged last: in all, and of points lately."""
-
-    dropped: Counter[str]
-    counts: Counter[str]
-    unstamped: Counter[str]
-    lately: Counter[str]
-    is_paused: bool
-    has_seen: bool  # any landmark, ever
-
-
-def of_node(
-    estimator: Estimate, inputs: Sequence[InputNumbers], progress: Progress
-) -> list[Finding]:
-    """Judge where the robot is, what came, and what is estimated."""
-    findings = _of_place(estimator)
-    if progress.dropped and not progress.is_paused:
-        # What came while the node was paused or inactive was not to be used.
-        findings += [
-            found('unused_input', count=each.received, topic=each.topic)
-            for each in inputs
-            if each.name in USED_AS
-            and each.received >= MANY_UNUSED
-            and not estimator.counts[USED_AS[each.name]]
-        ]
-    findings += [
-        found('silent_input', topic=each.topic)
-        for each in inputs
-        if not each.problem and each.silent_s > SILENT_S
-    ]
-    if progress.is_paused:
-        findings.append(found('paused'))
-    elif total := progress.dropped.total():
-        (reason, _), *others = progress.dropped.most_common()
-        count = f'{total} message{"s" * (total != 1)}'
-        reasons = f'mostly {reason}' if others else reason
-        findings.append(found('dropped_messages', count=count, reasons=reasons))
-    said = [*(each.unread for each in inputs), *(each.doubt for each in inputs)]
-    findings += [finding for finding in said if finding is not None]
-    findings += of_stamps(progress.unstamped)
-    if not progress.has_seen and (observations := estimator.counts['observation']) >= MANY_EMPTY:
-        findings.append(found('empty_messages', count=observations))
-    findings += estimator.ids_at_two_places
-    findings += of_left_out(progress.counts, Level.WARNING)
-    if progress.lately['observed_point'] >= MIN_POINTS:
-        findings += of_rejections(progress.lately, 'seen lately ')
-    findings += of_velocity(estimator) + of_estimate(estimator)
-    return findings + of_map_without_ids(estimator, estimator.ambiguity)
-
-
-def _of_place(estimator: Estimate) -> list[Finding]:
-    if estimator.is_localised:
-        return []
-    findings, problem = [found('unknown_pose')], estimator.localisation_problem
-    # Landmarks that came without an id have one that was given here.
-    is_by_place = is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)
-    return [*findings, problem] if problem and is_by_place else findings
 
 
 def deviations(estimator: Estimate) -> tuple[float, float] | None:

@@ -8,50 +8,244 @@ unit of what was recorded, k being 2 in the plane and 3 in space.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, replace
-import logging
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, groupby
 import math
 import time
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from slam_observer_ros.common.findings import Finding, found
-from slam_observer_ros.common.stamps import to_ns
+from slam_observer_ros.common.findings import Finding, found, muted_warnings
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
+    AngularVelocityEvent,
     Event,
     ObservationEvent,
+    POINT,
+    UNKNOWN_ID,
     VelocityBlock,
+    VelocityEvent,
 )
 from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.models.observation_noise import ObservationNoise
-from slam_observer_ros.runs.accuracy import Likelihood, LikelihoodRecorder
-from slam_observer_ros.runs.corrections import (
-    ALIKE,
-    AS_IT_IS,
-    AS_SIZED,
-    Correction,
-    CORRECTIONS,
-    first_drive,
-    in_blocks,
-    IN_DEGREES,
-    IN_MAP,
-    MIRRORED,
-    never_turns,
-    PAIRS,
-    SIZED,
-    turned,
-)
+from slam_observer_ros.runs.recorders import Likelihood, LikelihoodRecorder
 from slam_observer_ros.settings.estimator_settings import Settings
 
+_IDENTITY = np.eye(3)
+EventT = TypeVar('EventT', bound=Event | VelocityBlock)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What makes a recording right again that was made with a mistake of one kind."""
+
+    kind: str  # of finding; '' if nothing is wrong
+    points: FloatArray = field(default_factory=lambda: _IDENTITY)  # (3, 3), times each point
+    turn: float = 1.0  # times the angular velocity
+    drive: float = 1.0  # times the linear velocity
+    changes: Mapping[str, Any] = field(default_factory=dict)  # of settings, while it is judged
+    parts: tuple[Correction, ...] = ()  # of a pair of mistakes
+
+    def goes_with(self, other: Correction) -> bool:
+        """Return whether both can be of one set-up, and are not the same as a single one."""
+        kinds = {self.kind, other.kind}
+        return len(kinds) == 2 and kinds not in ALIKE
+
+    def and_then(self, other: Correction) -> Correction:
+        """Return the correction of both mistakes."""
+        return Correction(
+            '',
+            other.points @ self.points,
+            self.turn * other.turn,
+            self.drive * other.drive,
+            parts=(self, other),
+        )
+
+    def apply(
+        self, events: Iterable[EventT], noise: ObservationNoise | None = None
+    ) -> Iterable[EventT]:
+        """Yield the events as they should have been recorded.
+
+        With ``noise`` points keep theirs, as a share of their distance: else a world that shrinks
+        would be likelier where noise is stated too large.
+        """
+        scales = np.repeat([self.turn, self.drive], 3)
+        for event in events:
+            if isinstance(event, ObservationEvent):
+                covariances = event.covariances if noise is None else noise.covariances(event)
+                M = self.points_seen_along(event.sensor_axis)
+                moved = event.lines_of_sight @ (M - _IDENTITY).T
+                yield replace(
+                    event,
+                    points=event.points + moved,
+                    covariances=None if covariances is None else M @ covariances @ M.T,
+                    orientations=None,
+                    orientation_covariances=None,
+                )
+            elif isinstance(event, VelocityEvent):
+                yield replace(event, body_velocity=scales * event.body_velocity)
+            elif isinstance(event, VelocityBlock):
+                yield replace(event, body_velocities=scales * event.body_velocities)
+            else:
+                yield replace(event, angular_velocity=self.turn * event.angular_velocity)
+
+    def points_seen_along(self, axis: FloatArray | None) -> FloatArray:
+        """Return by what lines of sight (3,) are multiplied that a sensor has which looks there.
+
+        Such a sensor is turned about z against the robot, whose axes the event has.
+        """
+        if axis is None or not axis[:2].any():
+            return self.points
+        R = so3.exp(np.array([0.0, 0.0, math.atan2(axis[1], axis[0])]))
+        turned: FloatArray = R @ self.points @ R.T
+        return turned
+
+    def scale(self) -> float:
+        """Return by what lengths are multiplied."""
+        return float(abs(np.linalg.det(self.points)) ** (1.0 / 3.0))
+
+
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""From a camera's axes, z forward and x to the right, to a robot's."""
+
+IN_DEGREES = math.radians(1.0)
+
+SIZED = {'linear_scale_stddev': (0.0, 0.0, 0.0)}
+"""A wheel's scale that is estimated would make up for the size of tags."""
+
+AS_IT_IS, AS_SIZED = Correction(''), Correction('', changes=SIZED)
+
+CORRECTIONS = (
+    Correction('points_in_optical_axes', OPTICAL),
+    Correction('points_mirrored', np.diag([1.0, -1.0, 1.0])),
+    Correction('points_backwards', np.diag([-1.0, -1.0, 1.0])),
+    Correction('points_in_millimetres', 1e-3 * _IDENTITY),
+    *(
+        Correction('tag_size', s * _IDENTITY, changes=SIZED)
+        for s in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
+    ),
+    Correction('turning_in_degrees', turn=IN_DEGREES),
+    Correction('speed_in_kmh', drive=1.0 / 3.6),
+    Correction('turning_negated', turn=-1.0),
+    Correction('driving_negated', drive=-1.0),
+)
+
+MIRRORED = {'points_mirrored', 'turning_negated'}
+ALIKE = (MIRRORED, {'points_backwards', 'driving_negated'})
+"""Mirror images of each other, and what differs by which end of the robot is its front."""
+
+IN_MAP = (
+    *CORRECTIONS,
+    Correction(
+        '',
+        np.diag([1.0, -1.0, 1.0]),
+        turn=-1.0,
+        parts=tuple(each for each in CORRECTIONS if each.kind in MIRRORED),
+    ),
+)
+"""With both mirror images at once, of which a robot without a map notices nothing."""
+
+PAIRS = tuple(
+    one.and_then(other)
+    for one, other in combinations([each for each in CORRECTIONS if not each.changes], 2)
+    if one.goes_with(other)
+)
+
+DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
+"""Time of driving, and turns, that are looked at: who stands or goes straight on says little."""
+
+MOST_S = 300.0
+"""Time in all, at most."""
+
+
+def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
+    """Return the events until the robot has driven for DRIVE_S, with points that have ids.
+
+    Or until a ``part`` of that.
+    """
+    kept: list[Event] = []
+    drive, first_ns = Drive(), None
+    for event in events:
+        first_ns = event.stamp_ns if first_ns is None else first_ns
+        is_enough = drive.driven_s > part * DRIVE_S and drive.turned_rad > part * TURNED_RAD
+        if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
+            break
+        drive.add(event)
+        if isinstance(event, ObservationEvent):
+            usable = event.ids != UNKNOWN_ID
+            if event.kinds is not None:
+                usable &= event.kinds == POINT
+            event = event.select(usable)
+        kept.append(event)
+    return kept
+
+
+def in_blocks(events: Iterable[Event]) -> Iterator[Event | VelocityBlock]:
+    """Yield events with the velocities that follow each other in blocks, which take less time."""
+    for alike, group in groupby(events, key=_of_a_block):
+        if alike is None:
+            yield from group
+            continue
+        velocities = [each for each in group if isinstance(each, VelocityEvent)]
+        covariances = [each.covariance for each in velocities if each.covariance is not None]
+        received = [each.receive_ns for each in velocities if each.receive_ns is not None]
+        yield VelocityBlock(
+            np.array([each.stamp_ns for each in velocities]),
+            np.array([each.body_velocity for each in velocities]),
+            np.array(covariances) if covariances else None,
+            np.array(received) if received else None,
+            is_mean=velocities[0].is_mean,
+        )
+
+
+def _of_a_block(event: Event) -> tuple[bool, bool, bool] | None:
+    """Return what velocities of a block have in common; None for what is no velocity."""
+    if not isinstance(event, VelocityEvent):
+        return None
+    return event.is_mean, event.covariance is None, event.receive_ns is None
+
+
+class Drive:
+    """How long the robot drives, and by how much velocities turn it.
+
+    These are radians if the velocities are in rad/s. A velocity that is held for more than a
+    second says nothing any more.
+    """
+
+    def __init__(self, events: Iterable[Event] = ()) -> None:
+        self.driven_s, self.turned_rad = 0.0, 0.0
+        self._last: VelocityEvent | None = None
+        for event in events:
+            self.add(event)
+
+    def add(self, event: Event) -> None:
+        """Take in an event."""
+        if not isinstance(event, VelocityEvent):
+            return
+        if self._last is not None and self._last.body_velocity.any():
+            held_s = min(to_s(max(event.stamp_ns - self._last.stamp_ns, 0)), 1.0)
+            self.driven_s += held_s
+            self.turned_rad += held_s * float(np.linalg.norm(self._last.body_velocity[:3]))
+        self._last = event
+
+
+def never_turns(events: Iterable[Event]) -> bool:
+    """Return whether the robot drives, and all its angular velocities are exactly zero."""
+    moves = [each.body_velocity for each in events if isinstance(each, VelocityEvent)]
+    turns = [each.angular_velocity for each in events if isinstance(each, AngularVelocityEvent)]
+    turns += [move[:3] for move in moves]
+    return any(move.any() for move in moves) and not any(turn.any() for turn in turns)
+
+
 Maps: TypeAlias = LandmarkMap | Sequence[LandmarkMap]
-Result = TypeVar('Result')
+T = TypeVar('T')
 
 SURE, CLEAR = 25.0, 0.05
 """ln of how many times likelier all points must be, and each on average."""
@@ -111,21 +305,17 @@ class Search:
     def advance(self, seconds: float) -> bool:
         """Go on for some time; return whether the end is reached, and ``findings`` are known."""
         end_s = time.perf_counter() + seconds
-        log = logging.getLogger('slam_observer_ros')
-        level = log.level
-        log.setLevel(logging.CRITICAL)  # what is wrong with a trial is no news
         try:
-            while time.perf_counter() < end_s:
-                next(self._steps)
+            with muted_warnings():  # what is wrong with a trial is no news
+                while time.perf_counter() < end_s:
+                    next(self._steps)
         except StopIteration as end:
             self.findings = end.value
             return True
-        finally:
-            log.setLevel(level)
         return False
 
 
-Steps: TypeAlias = Generator[None, None, Result]
+Steps: TypeAlias = Generator[None, None, T]
 """What returns a result, and yields after each event that it has used."""
 
 
@@ -178,7 +368,7 @@ def _best(
     """
     early, tried = first_drive(events, EARLY), []
     at_first = before.until(early[-1].stamp_ns)
-    is_in_degrees = turned(events) * IN_DEGREES > LEAST_TURN_RAD
+    is_in_degrees = Drive(events).turned_rad * IN_DEGREES > LEAST_TURN_RAD
     for each in corrections:
         if each.kind != 'turning_in_degrees' or is_in_degrees:
             score = yield from _score(settings, early, each, known)

@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 from recordings import events, write_mcap, write_rosbag1
 
-from slam_observer_ros.cli.batch_index import write_index
-from slam_observer_ros.cli.batch_jobs import grid_points, opened_log, part_of, read_logs
+from slam_observer_ros.cli.batch import grid_points, opened_log, part_of, read_logs
 from slam_observer_ros.cli.batch_pool import local_pool
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.runs.accuracy import FIGURES
+from slam_observer_ros.report.batch_index import write_index
+from slam_observer_ros.report.summary import FIGURES
 
 PATIENCE_S = 60.0
 RUN = {
@@ -58,13 +58,13 @@ def test_a_line_that_does_not_fit_on_the_disk_is_an_error_that_names_the_file(tm
     try:
         with (
             pytest.raises(OutputError, match=r"can't write .*runs\.jsonl: File too large"),
-            opened_log(path) as log,
+            opened_log(path) as append,
         ):
-            log.append(RUN)
+            append(RUN)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    with opened_log(path) as log:
-        log.append(RUN)
+    with opened_log(path) as append:
+        append(RUN)
     assert list(read_logs(tmp_path)) == ['a']
 
 
@@ -253,8 +253,8 @@ def _is_alive(group: int) -> bool:
 
 
 def test_no_two_batches_write_to_one_file(tmp_path):
-    with opened_log(tmp_path / 'runs.jsonl') as log:
-        log.append(RUN)
+    with opened_log(tmp_path / 'runs.jsonl') as append:
+        append(RUN)
         with (
             pytest.raises(OutputError, match='another batch'),
             opened_log(tmp_path / 'runs.jsonl'),

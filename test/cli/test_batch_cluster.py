@@ -13,7 +13,7 @@ import pytest
 from recordings import SAMPLE
 
 from slam_observer_ros.cli import batch_pool
-from slam_observer_ros.cli.batch_jobs import read_logs
+from slam_observer_ros.cli.batch import read_logs
 
 pytest.importorskip('distributed', reason="no Dask is installed (pip's extra 'cluster')")
 

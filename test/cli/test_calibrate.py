@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from slam_observer_ros.cli.calibration_finder import driven, opened
-from slam_observer_ros.cli.calibration_stated import trades
+from slam_observer_ros.cli.calibrate import trades
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.lie import so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_file import write_map
 from slam_observer_ros.recordings.writer import RecordingWriter
+from slam_observer_ros.runs.calibration import driven, opened
 from slam_observer_ros.settings.estimator_settings import Settings
 
 MODEL = {

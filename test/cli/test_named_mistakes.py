@@ -10,10 +10,10 @@ import pytest
 from recordings import write_events
 
 from slam_observer_ros.cli.main import main
+from slam_observer_ros.common.findings import MISTAKES, SYMPTOMS
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.mapping.map_file import write_map
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.runs.corrections import MISTAKES, SYMPTOMS
 
 OPTIONS = ('--config', 'wheeled_robot', '--set', 'bearing_noise=0.01')
 

@@ -31,8 +31,7 @@ from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, Vel
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.models.velocity_history import VelocityHistory
-from slam_observer_ros.runs.consistency import average_nees
-from slam_observer_ros.runs.metrics import pose_errors
+from slam_observer_ros.runs.metrics import average_nees, pose_errors
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking import step as state_step
 from slam_observer_ros.tracking.hypotheses import Hypotheses

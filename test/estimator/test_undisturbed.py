@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 
+from slam_observer_ros.common.findings import explained, OF_ODOMETRY
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.runs.corrections import explained, OF_ODOMETRY
 from slam_observer_ros.runs.health import of_estimate
 from slam_observer_ros.settings.estimator_settings import Settings
 

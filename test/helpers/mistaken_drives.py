@@ -9,7 +9,7 @@ import numpy as np
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.runs.corrections import Correction, OPTICAL
+from slam_observer_ros.runs.mistakes import Correction, OPTICAL
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SETTINGS = Settings(

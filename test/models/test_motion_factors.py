@@ -17,7 +17,7 @@ from slam_observer_ros.models.held_velocities import HeldVelocities
 from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.models.motion_noise import MotionFactors, MotionNoise
 from slam_observer_ros.runs.health import of_noise
-from slam_observer_ros.runs.reported_run import NisTally
+from slam_observer_ros.runs.recorders import NisTally
 from slam_observer_ros.settings.estimator_settings import Settings
 
 RIGHT = Settings(

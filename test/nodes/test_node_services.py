@@ -32,8 +32,7 @@ from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.ros_node import LATCHED_QOS, MESSAGES, TFMessage
-from slam_observer_ros.runs.health import of_calibration
-from slam_observer_ros.runs.live_health import MANY_UNUSED
+from slam_observer_ros.runs.health import MANY_UNUSED, of_calibration
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import Scenario
 

@@ -14,11 +14,11 @@ import pytest
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import flatten_velocities, ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
-from slam_observer_ros.runs.consistency import (
+from slam_observer_ros.runs.metrics import (
     average_nees_band,
     normalised_squared_errors,
+    pose_errors,
 )
-from slam_observer_ros.runs.metrics import pose_errors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 BENCHMARK = Path(__file__).resolve().parents[2] / 'benchmark'

@@ -19,11 +19,11 @@ import setuptools  # noqa: F401 (provides distutils)
 import yaml
 
 from slam_observer_ros.cli.main import make_parser
-from slam_observer_ros.cli.replay import as_json, identity
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_file import read_map
 from slam_observer_ros.nodes import launch_setup
+from slam_observer_ros.report.summary import as_json, identity
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.settings.parameter_table import table

@@ -18,8 +18,7 @@ from slam_observer_ros import __version__
 from slam_observer_ros.cli.main import main
 from slam_observer_ros.events import BEARING, ObservationEvent, RANGE
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.runs.consistency import ellipses
-from slam_observer_ros.runs.error_health import growth_windows
+from slam_observer_ros.runs.run_health import growth_windows
 
 MEGABYTE = 1_000_000
 
@@ -135,15 +134,6 @@ def test_growth_is_found_where_the_error_rises():
     (window,) = growth_windows(seconds, errors_m)
     assert window == (window[0], 120)
     assert 110 <= window[0] < 120
-
-
-def test_an_ellipse_has_its_axes_along_those_of_the_covariance():
-    covariance = np.diag([4.0, 1.0, 9.0])
-    plan, side = (ellipses(covariance[None], plane)[0] for plane in ((0, 1), (0, 2)))
-    assert plan[:2] == pytest.approx(np.sqrt(5.991464547) * np.array([2.0, 1.0]))
-    assert side[:2] == pytest.approx(np.sqrt(5.991464547) * np.array([3.0, 2.0]))
-    assert abs(np.sin(plan[2])) == pytest.approx(0.0, abs=1e-9)
-    assert abs(np.cos(side[2])) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_browser_draws_it_without_an_error_and_asks_no_network(report):

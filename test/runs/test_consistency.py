@@ -13,11 +13,11 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.models.observation_noise import ObservationNoise
-from slam_observer_ros.runs.consistency import (
+from slam_observer_ros.runs.metrics import (
     average_nees_band,
     normalised_squared_errors,
+    pose_errors,
 )
-from slam_observer_ros.runs.metrics import pose_errors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 RUNS = 30

@@ -12,7 +12,7 @@ from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID, FloatArray
 from slam_observer_ros.lie import se3
 from slam_observer_ros.recordings.trajectory import LandmarkTruth, Trajectory
-from slam_observer_ros.runs import consistency, metrics
+from slam_observer_ros.runs import metrics
 from slam_observer_ros.runs.metrics import ConfigurationError, MAX_JOINT
 
 STAMPS_NS = np.arange(40) * 100_000_000
@@ -163,7 +163,7 @@ def random_covariance(rng: np.random.Generator, d: int) -> FloatArray:
 def test_nees_does_not_depend_on_units(rng: np.random.Generator, unit: float) -> None:
     covariance, error = random_covariance(rng, 6), rng.normal(size=6)
     scale = np.array([1.0, 1.0, 1.0, unit, unit, unit])
-    nees, degrees_of_freedom = consistency.normalised_squared_errors(
+    nees, degrees_of_freedom = metrics.normalised_squared_errors(
         scale * error, np.outer(scale, scale) * covariance
     )
     assert nees == pytest.approx(error @ np.linalg.solve(covariance, error), rel=1e-6)
@@ -174,25 +174,23 @@ def test_exactly_known_directions_do_not_count() -> None:
     covariance = np.zeros((6, 6))
     covariance[2:5, 2:5] = random_covariance(np.random.default_rng(0), 3)
     error = np.arange(6.0)
-    nees, degrees_of_freedom = consistency.normalised_squared_errors(error, covariance)
+    nees, degrees_of_freedom = metrics.normalised_squared_errors(error, covariance)
     assert degrees_of_freedom == 3
     assert nees == pytest.approx(error[2:5] @ np.linalg.solve(covariance[2:5, 2:5], error[2:5]))
-    assert consistency.average_nees(error[None], np.zeros((1, 6, 6))) is None
+    assert metrics.average_nees(error[None], np.zeros((1, 6, 6))) is None
 
 
 @given(generators())
 def test_what_is_known_exactly_need_not_lie_along_an_axis(rng: np.random.Generator) -> None:
     root, components = rng.normal(size=(6, 3)), rng.normal(size=3)
-    nees, degrees_of_freedom = consistency.normalised_squared_errors(
-        root @ components, root @ root.T
-    )
+    nees, degrees_of_freedom = metrics.normalised_squared_errors(root @ components, root @ root.T)
     assert degrees_of_freedom == 3
     assert nees == pytest.approx(components @ components)
 
 
 def test_an_indefinite_covariance_is_refused() -> None:
     with pytest.raises(EvaluationError, match='negative'):
-        consistency.average_nees(np.ones((1, 2)), np.array([[[1.0, 2.0], [2.0, 1.0]]]))
+        metrics.average_nees(np.ones((1, 2)), np.array([[[1.0, 2.0], [2.0, 1.0]]]))
 
 
 @pytest.mark.parametrize('k', [2, 3])
@@ -243,15 +241,15 @@ def test_the_band_separates_honest_covariances_from_others(inflation: float, ins
     rng = np.random.default_rng(5)
     covariance = random_covariance(rng, 6)
     errors = rng.multivariate_normal(np.zeros(6), covariance, size=200)
-    average = consistency.average_nees(errors, np.tile(inflation * covariance, (200, 1, 1)))
-    lower, upper = consistency.average_nees_band(6, runs=200)
+    average = metrics.average_nees(errors, np.tile(inflation * covariance, (200, 1, 1)))
+    lower, upper = metrics.average_nees_band(6, runs=200)
     assert average is not None
     assert (lower < average < upper) is inside
 
 
 def test_the_band_is_that_of_the_chi_square_distribution() -> None:
     # Bar-Shalom's Estimation with Applications to Tracking, 50 runs of 2 degrees of freedom.
-    lower, upper = consistency.average_nees_band(2, runs=50)
+    lower, upper = metrics.average_nees_band(2, runs=50)
     assert (2 * lower, 2 * upper) == pytest.approx((1.5, 2.6), abs=0.02)
 
 
@@ -262,10 +260,10 @@ def test_anchored_nees_ignores_the_worlds_and_starts_at_zero(
     estimate, truth = random_pair(rng)
     covariances = np.tile(np.eye(6), (len(STAMPS_NS), 1, 1))
     covariances[0] = 0.0
-    here = consistency.anchored_average_nees(estimate, covariances, truth)
-    there = consistency.anchored_average_nees(estimate, covariances, truth.moved(G))
+    here = metrics.anchored_average_nees(estimate, covariances, truth)
+    there = metrics.anchored_average_nees(estimate, covariances, truth.moved(G))
     assert here == pytest.approx(there, rel=1e-6)
-    exact = consistency.anchored_average_nees(truth.moved(G), covariances, truth)
+    exact = metrics.anchored_average_nees(truth.moved(G), covariances, truth)
     assert exact == pytest.approx(0.0, abs=1e-15)
 
 
@@ -275,8 +273,8 @@ def test_where_the_truth_has_a_gap_errors_are_compared_with_their_own_covariance
     seen = np.r_[:5, 25 : len(STAMPS_NS)]
     gapped = Trajectory(STAMPS_NS[seen], truth.poses[seen])
     part = Trajectory(STAMPS_NS[seen], estimate.poses[seen])
-    assert consistency.anchored_average_nees(estimate, covariances, gapped) == pytest.approx(
-        consistency.anchored_average_nees(part, covariances[seen], gapped)
+    assert metrics.anchored_average_nees(estimate, covariances, gapped) == pytest.approx(
+        metrics.anchored_average_nees(part, covariances[seen], gapped)
     )
 
 
@@ -288,11 +286,11 @@ def test_the_anees_is_not_reported_where_the_first_heading_is_uncertain_and_the_
     covariances = np.tile(np.eye(6), (len(STAMPS_NS), 1, 1))
     covariances[0] = np.diag([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]) ** 2
     near = Trajectory(STAMPS_NS, poses.copy())
-    assert consistency.anchored_average_nees(near, covariances, near) == 0.0
+    assert metrics.anchored_average_nees(near, covariances, near) == 0.0
     poses[1:, 0, 3] = 100.0
     far = Trajectory(STAMPS_NS + 10**9, poses)
     with pytest.raises(EvaluationError, match=r'begins 0\.0 s after the estimate'):
-        consistency.anchored_average_nees(far, covariances, far)
+        metrics.anchored_average_nees(far, covariances, far)
 
 
 def test_the_anees_is_honest_or_not_reported_where_the_truth_begins_late() -> None:
@@ -311,11 +309,11 @@ def test_the_anees_is_honest_or_not_reported_where_the_truth_begins_late() -> No
         estimate = Trajectory(STAMPS_NS, moved)
         for start in (0, 4):
             late = Trajectory(STAMPS_NS[start:], rest[start:])
-            values.append(consistency.anchored_average_nees(estimate, covariances, late))
+            values.append(metrics.anchored_average_nees(estimate, covariances, late))
         for start in (7, 30):
             late = Trajectory(STAMPS_NS[start:], truth.poses[start:])
             with pytest.raises(EvaluationError, match=r'begins .* s after the estimate'):
-                consistency.anchored_average_nees(estimate, covariances, late)
+                metrics.anchored_average_nees(estimate, covariances, late)
     assert 0.7 < np.mean(values) < 1.3
 
 
@@ -350,4 +348,4 @@ def test_an_estimate_is_interpolated_where_the_truth_is_sparse(period_s: float) 
     assert errors.covered_share == pytest.approx(true_s[-1] / 60.0, abs=0.01)
     P = np.broadcast_to(np.eye(6) * 0.01, (len(estimate), 6, 6)).copy()
     P[0] = 0.0
-    assert consistency.anchored_average_nees(estimate, P, truth) is not None
+    assert metrics.anchored_average_nees(estimate, P, truth) is not None

@@ -8,11 +8,10 @@ from mistaken_drives import drive, MADE, PERIOD_NS, SETTINGS, surveyed
 import numpy as np
 import pytest
 
-from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.findings import explained, found
 from slam_observer_ros.events import ObservationEvent, RANGE, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.lie import so3
-from slam_observer_ros.runs.corrections import explained, first_drive
-from slam_observer_ros.runs.mistakes import mistakes
+from slam_observer_ros.runs.mistakes import first_drive, mistakes
 
 
 def named(events, settings=SETTINGS):

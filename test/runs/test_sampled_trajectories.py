@@ -14,8 +14,8 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.recordings.trajectory import Truth
+from slam_observer_ros.runs.recorders import SAMPLE_PERIOD_NS
 from slam_observer_ros.runs.replay import replay
-from slam_observer_ros.runs.sampling import SAMPLE_PERIOD_NS
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SECOND = 10**9

@@ -1,35 +1,242 @@
-"""What a recording shows: estimated with wide priors, and what else is likely by comparison."""
+"""What recordings show of sensor and odometry, and whether it holds on what was held out.
+
+It is estimated with wide priors; what no filter estimates is what makes a drive most likely.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from slam_observer_ros.cli.calibration_stated import COMMON_SCALE, Found, trades
-from slam_observer_ros.cli.held_out import judge, Judged, Material, SURE
-from slam_observer_ros.cli.noise_search import (
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, MotionFactor
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
+from slam_observer_ros.lie.axes import axes_of
+from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.models.calibration import OF_VELOCITY
+from slam_observer_ros.models.sensing import cosines, LEAST_COSINE
+from slam_observer_ros.recordings.opening import sha256_of
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.trajectory import Truth
+from slam_observer_ros.runs.noise_search import (
     kinds_of,
     NoiseFactor,
     of_points,
     scaled,
     search_noise,
 )
-from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
-from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.lie.axes import axes_of
-from slam_observer_ros.models.calibration import OF_VELOCITY
-from slam_observer_ros.models.sensing import cosines, LEAST_COSINE
-from slam_observer_ros.runs.accuracy import Likelihood
+from slam_observer_ros.runs.recorders import Likelihood, LikelihoodRecorder
+from slam_observer_ros.runs.replay import replay
+from slam_observer_ros.runs.result import Request
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.settings.parameter_table import Value
+
+BLOCKS = 20
+"""Parts of a recording in time by which it is judged whether a gain may be chance."""
+
+SURE = 2.0
+"""Standard deviations by which the likelihood must grow."""
+
+WORSE_ERROR = 1.05
+WORSE_CONSISTENCY = 1.5
+"""Factors by which the error, or how far the ANEES is from 1, may grow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """How settings do on what was held out; errors are None where the truth is not known."""
+
+    likelihood: Likelihood
+    configuration_rmse_m: float | None
+    configuration_anees: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Figures of what was held out, before and after; the ``objection`` is '' if all is better.
+
+    Log likelihoods are per observation; errors are root mean squares over the recordings, and
+    ANEES means; None where the truth is not known.
+    """
+
+    log_likelihood: tuple[float, float]
+    gain: float
+    gain_deviation: float
+    error_m: tuple[float, float] | None
+    anees: tuple[float, float] | None
+    objection: str
+
+
+def judge(before: Sequence[Judged], after: Sequence[Judged]) -> Verdict:
+    """Compare settings on the recordings that were held out, in the same order."""
+    likelihoods = [[each.likelihood for each in one] for one in (before, after)]
+    per_before, per_after = (
+        sum(each.total for each in one) / sum(each.count for each in one) for one in likelihoods
+    )
+    gain, deviation = growth(*likelihoods)
+    error_m = _means(before, after, 'configuration_rmse_m', 2.0)
+    anees = _means(before, after, 'configuration_anees', 1.0)
+    objection = ''
+    if not gain > SURE * deviation:
+        objection = (
+            f'the log likelihood changes by {gain:.1f} ± {deviation:.1f}, which may be chance'
+        )
+    elif error_m is not None and error_m[1] > WORSE_ERROR * error_m[0]:
+        objection = f'the error grows from {error_m[0]:.3g} to {error_m[1]:.3g} m'
+    elif anees is not None:
+        off = [abs(math.log(value)) for value in anees]
+        if off[1] > off[0] + math.log(WORSE_CONSISTENCY):
+            objection = f'the ANEES goes from {anees[0]:.2g} to {anees[1]:.2g}, away from 1'
+    return Verdict((per_before, per_after), gain, deviation, error_m, anees, objection)
+
+
+def growth(before: Sequence[Likelihood], after: Sequence[Likelihood]) -> tuple[float, float]:
+    """Return by how much the log likelihood of recordings grows, and the deviation of that.
+
+    By how much it grows in each of some parts of a recording shows what chance does.
+    """
+    gains = []
+    for pair in zip(before, after, strict=True):
+        stamps_ns = np.concatenate([one.stamps_ns for one in pair])
+        edges = np.linspace(stamps_ns.min(), stamps_ns.max() + 1, BLOCKS + 1)
+        of_before, of_after = (
+            np.histogram(one.stamps_ns, edges, weights=one.shares * one.log_densities)[0]
+            for one in pair
+        )
+        gains.append(of_after - of_before)
+    each = np.concatenate(gains)
+    return float(each.sum()), float(np.std(each) * math.sqrt(len(each)))
+
+
+def _means(
+    before: Sequence[Judged], after: Sequence[Judged], name: str, power: float
+) -> tuple[float, float] | None:
+    """Return the means of a figure, or of a power of it; None if one is not known."""
+    known = [
+        [value for each in one if (value := getattr(each, name)) is not None]
+        for one in (before, after)
+    ]
+    if not all(known):
+        return None
+    of_before, of_after = (
+        float(np.mean(np.array(values) ** power)) ** (1.0 / power) for values in known
+    )
+    return of_before, of_after
+
+
+HELD_OUT_SHARE = 1.0 / 3.0
+"""Part of a recording, at its end, that is held out where no other recording is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """A recording's events; those from ``split_ns`` on are held out, of what is trained on."""
+
+    path: Path
+    sha256: str
+    events: Sequence[Event]
+    truth: Truth
+    reach_m: float
+    split_ns: int
+    landmark_map: LandmarkMap | None = None
+
+    def likelihood(self, settings: Settings) -> Likelihood:
+        """Return the figure of the part to train on."""
+        return self.trained(settings)[1]
+
+    def trained(self, settings: Settings) -> tuple[Estimator, Likelihood]:
+        """Return what comes of the part to train on; a UsageError if it is not in the map."""
+        recorder = self._recorder(settings)
+        estimator = Estimator(settings, on_update=recorder.note_update, judges_innovations=True)
+        if self.landmark_map is not None:
+            estimator.load_map(self.landmark_map)
+        for event in self.events:
+            if event.stamp_ns < self.split_ns:
+                estimator.add(event)
+        estimator.flush()
+        if problem := estimator.localisation_problem:
+            raise UsageError(
+                f'{self.path}: the pose in the map was not found: {problem.what}; {problem.remedy}'
+            )
+        return estimator, recorder.likelihood
+
+    def judged(self, settings: Settings) -> Judged:
+        """Return how settings do on the part that is held out, after all that was before it."""
+        recorder, is_held_out = self._recorder(settings), self.truth.stamps_ns >= self.split_ns
+        stamps_ns, poses = self.truth.stamps_ns[is_held_out], self.truth.poses[is_held_out]
+        truth = replace(self.truth, stamps_ns=stamps_ns, poses=poses)
+        result = replay(self.events, settings, truth, self.landmark_map, recorders=[recorder])
+        likelihood = recorder.likelihood
+        return Judged(
+            likelihood.select(likelihood.stamps_ns >= self.split_ns),
+            result.configuration.rmse_m,
+            result.configuration.anees,
+        )
+
+    def _recorder(self, settings: Settings) -> LikelihoodRecorder:
+        return LikelihoodRecorder(axes_of(settings.two_d_mode).point, self.reach_m)
+
+
+def read_material(
+    request: Request, held_out_share: float, landmark_map: LandmarkMap | None = None
+) -> Material:
+    """Read a recording; its last part is to be held out."""
+    path = request.recording
+    with Recording(path) as recording:
+        selected, inputs, truth = request.select_inputs(recording)
+        events = list(recording.events(selected, inputs, request.settings.velocity_timeout))
+    seen = [event for event in events if isinstance(event, ObservationEvent) and len(event.ids)]
+    if not seen:
+        raise UsageError(f'{path}: no landmark is seen')
+    ids = np.concatenate([event.ids for event in seen])
+    if 2 * np.count_nonzero(ids == UNKNOWN_ID) > len(ids):
+        raise UsageError(
+            f'{path}: it needs landmarks with ids: without, what is taken for which depends on '
+            'the noise itself'
+        )
+    first_ns, last_ns = (f(event.stamp_ns for event in events) for f in (min, max))
+    split_ns = last_ns + 1 - round(held_out_share * (last_ns + 1 - first_ns))
+    reach_m = max(float(np.linalg.norm(event.points, axis=1).max()) for event in seen)
+    digest = sha256_of(path)
+    return Material(path, digest, events, truth, reach_m, split_ns, landmark_map)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What was found; the ``depth_gain`` is of the log likelihood, and has its deviation."""
+
+    parts: list[CalibrationEstimate]  # c
+    correlations: FloatArray  # (c, c)
+    has_no_size: bool  # a common scale of wheels and ranges changes nothing that is seen
+    range_is_depth: bool
+    depth_gain: tuple[float, float] | None  # of depth over range; None if it can't be
+    noise: list[NoiseFactor]  # of points; where it alone is looked for, of motion, too
+    factors: list[MotionFactor]
+    too_noisy: list[str]  # scales of velocities that were not looked for
+
+    @property
+    def frames(self) -> set[str]:
+        """The frames of the sensors; '' is the base frame."""
+        return {
+            part.name.partition('/')[2]
+            for part in self.parts
+            if part.name.startswith(('sensor_', 'range_'))
+        }
+
 
 ROTATION, TRANSLATION = (0.1,) * 3, (0.1,) * 3
 """How a sensor may be mounted: some 6° and 10 cm off what is stated."""
@@ -184,18 +391,19 @@ class CalibrationFinder:
             settings = replace(
                 settings, velocity_delay=0.0, velocity_delay_stddev=min(delay.deviation, 0.1)
             )
-        noise = [] if keeps_noise else self._noise(settings)
+        noise = []
+        if not keeps_noise:
+            likelihoods = [self._material.likelihood]
+            noise = search_noise(likelihoods, settings, of_points(settings), self._advance)
         settings = scaled(settings, [one.kind for one in noise], [one.log for one in noise])
         estimator, _ = self._run(settings)
         # A filter seems to know what only shows where it has linearised: a common scale.
         smoothed = estimator.smooth()
         parts = [self._part(part, delay) for part in smoothed.calibration]
-        pairs = trades(parts, smoothed.calibration_correlations)
-        if self._material.landmark_map is None and not settings.range_scale_stddev:
-            pairs.insert(0, COMMON_SCALE)
         return Found(
             parts,
-            pairs,
+            smoothed.calibration_correlations,
+            self._material.landmark_map is None and not settings.range_scale_stddev,
             settings.range_is_depth,
             depth_gain,
             noise,
@@ -218,7 +426,12 @@ class CalibrationFinder:
 
     def _depth_or_range(self, settings: Settings) -> tuple[Settings, tuple[float, float] | None]:
         """Return settings as depth or range, what is surely more likely, and depth's gain."""
-        if not _may_be_depth(self._material):
+        behind = [
+            cosines(event.lines_of_sight, event.sensor_axis) <= LEAST_COSINE
+            for event in self._material.events
+            if isinstance(event, ObservationEvent) and len(event.ids)
+        ]
+        if np.mean(np.concatenate(behind)) > MAX_BEHIND:  # else all is before the sensor
             return replace(settings, range_is_depth=False), None
         (_, of_range), (_, of_depth) = (
             self._run(replace(settings, range_is_depth=is_depth)) for is_depth in (False, True)
@@ -258,11 +471,6 @@ class CalibrationFinder:
             stated=prior_s,
         )
 
-    def _noise(self, settings: Settings) -> list[NoiseFactor]:
-        """Return the most likely noise of points."""
-        likelihoods = [self._material.likelihood]
-        return search_noise(likelihoods, settings, of_points(settings), self._advance)
-
     def _part(
         self, part: CalibrationEstimate, delay: CalibrationEstimate | None
     ) -> CalibrationEstimate:
@@ -284,7 +492,7 @@ def find_noise(
     noise = search_noise(likelihoods, settings, kinds_of(settings), advance)
     if not noise:
         raise UsageError('no noise figure has an effect: messages state all covariances')
-    return Found([], [], settings.range_is_depth, None, noise, [], [])
+    return Found([], np.empty((0, 0)), False, settings.range_is_depth, None, noise, [], [])
 
 
 def delayed(material: Material, delay_s: float) -> Material:
@@ -317,20 +525,3 @@ def _maximum(
         return start, math.inf
     shift = 0.5 * (right - left) / step / curvature
     return start + min(max(shift, -step), step), curvature**-0.5
-
-
-def _may_be_depth(material: Material) -> bool:
-    """Return whether all that is seen is before the sensor."""
-    seen = [event for event in material.events if isinstance(event, ObservationEvent)]
-    behind = [
-        cosines(event.lines_of_sight, event.sensor_axis) <= LEAST_COSINE
-        for event in seen
-        if len(event.ids)
-    ]
-    return bool(np.mean(np.concatenate(behind)) <= MAX_BEHIND)
-
-
-def growth(before: Sequence[Likelihood], after: Sequence[Likelihood]) -> tuple[float, float]:
-    """Return by how much the log likelihood of recordings grows, and the deviation of that."""
-    verdict = judge(*([Judged(one, None, None) for one in each] for each in (before, after)))
-    return verdict.gain, verdict.gain_deviation

@@ -16,7 +16,7 @@ from scipy import optimize
 
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.runs.accuracy import Likelihood
+from slam_observer_ros.runs.recorders import Likelihood
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import table, Value
 

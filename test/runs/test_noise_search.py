@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import yaml
 
-from slam_observer_ros.cli.held_out import judge, Judged
-from slam_observer_ros.cli.noise_search import (
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.recordings.writer import RecordingWriter
+from slam_observer_ros.runs.calibration import judge, Judged
+from slam_observer_ros.runs.noise_search import (
     kinds_of,
     most_likely,
     remembered,
     scaled,
     without_effect,
 )
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.runs.accuracy import Likelihood
+from slam_observer_ros.runs.recorders import Likelihood
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import changed_names, table
 from slam_observer_ros.simulation import Scenario, Simulation

@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 from recordings import events
 
-from slam_observer_ros.runs import reported_run as recorder_module
+from slam_observer_ros.runs import recorders as recorder_module
+from slam_observer_ros.runs.recorders import RunRecorder
 from slam_observer_ros.runs.replay import replay
-from slam_observer_ros.runs.reported_run import RunRecorder
 from slam_observer_ros.settings.estimator_settings import Settings
+
+
+class Updates(list):
+    """All updates of a run."""
+
+    def note_update(self, update):
+        self.append(update)
 
 
 def recorded(**settings):
@@ -26,11 +33,14 @@ def test_recording_changes_no_bit_of_the_estimate(gains):
 
 
 def test_every_residual_is_judged_in_standard_deviations():
-    result, recorder = recorded()
+    recorder, updates = RunRecorder(), Updates()
+    replay(events(), Settings(), recorders=[recorder, updates])
     innovations = recorder.innovations
-    assert len(innovations.distances) == len(result.residuals)
-    assert np.allclose(innovations.residuals_m, np.linalg.norm(result.residuals, axis=1))
-    assert np.array_equal(innovations.weights == 0.0, result.rejected)
+    residuals = np.concatenate([update.residuals for update in updates])
+    rejected = np.concatenate([update.rejected for update in updates])
+    assert len(innovations.distances) == len(residuals)
+    assert np.allclose(innovations.residuals_m, np.linalg.norm(residuals, axis=1))
+    assert np.array_equal(innovations.weights == 0.0, rejected)
     assert np.isfinite(innovations.nis).all()
     assert np.array_equal(innovations.degrees_of_freedom, 9 * np.ones(len(innovations.nis)))
 

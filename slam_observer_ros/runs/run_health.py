@@ -1,0 +1,460 @@
+"""What only a whole run shows: its inputs, where errors grew, and which noise is too small.
+
+With true poses each axis of the motion is judged by itself; without, the time since landmarks were
+last used shows whether motion or points are at fault.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+import math
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.common.errors import significant
+from slam_observer_ros.common.findings import explained, Finding, found, Level, SUSPICIOUS
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.estimates import Innovations, Reason
+from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.recordings.decoding import input_decoders
+from slam_observer_ros.recordings.event_builder import NO_TRANSFORM
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.topics import SelectedTopics
+from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
+from slam_observer_ros.runs.health import (
+    of_all_learnt,
+    of_estimate,
+    of_fit,
+    of_left_out,
+    of_map,
+    of_map_without_ids,
+    of_ranges,
+    of_rejections,
+    of_stamps,
+)
+from slam_observer_ros.runs.metrics import TrajectoryErrors
+from slam_observer_ros.runs.recorders import RunRecorder
+from slam_observer_ros.runs.replay import Replay
+from slam_observer_ros.runs.result import list_dropped, MALFORMED, Result
+from slam_observer_ros.settings.node_settings import (
+    InputSettings,
+    ObserverNodeSettings,
+    POSE_DIFFERENCES,
+)
+
+
+def judged(
+    result: Result,
+    recording: Recording,
+    inputs: InputSettings,
+    unused: Sequence[Finding],
+    map_path: Path | None,
+    look_for_mistakes: Callable[[], Sequence[Finding]],
+) -> list[Finding]:
+    """Return what is wrong; ``unused`` is of inputs of which nothing was used."""
+    run, selected = result.run, result.selected
+    findings = [*unused]
+    if not run.estimator.is_localised and run.localised_ns is not None:
+        end_s = run.seconds_until(run.localised_ns[1])
+        findings.append(found('lost_pose', path=map_path, seconds=end_s))
+    findings += of_recording(recording, selected, inputs, run)
+    findings += _of_run(result)
+    findings += of_timing(recording, selected)
+    if isinstance(result.recorder, RunRecorder):
+        findings += of_errors(result)
+    reasons = [*findings, *of_all_learnt(run.estimator)]
+    if run.estimator.counts['slip'] or any(each.kind in SUSPICIOUS for each in reasons):
+        findings = [*look_for_mistakes(), *findings]
+    return sorted(explained(findings), key=lambda finding: -finding.level)
+
+
+def _of_run(result: Result) -> Iterator[Finding]:
+    """Judge the estimate as /diagnostics does, and what only a whole run shows."""
+    run = result.run
+    estimator, counts = run.estimator, run.estimator.counts
+    yield from of_rejections(counts)
+    # What ranges are taken for comes first: where that is wrong, noise makes up for it.
+    yield from of_ranges(run.range_power, estimator.settings.range_is_depth)
+    yield from of_estimate(estimator)
+    ambiguity = estimator.longest_ambiguity
+    for finding in of_map_without_ids(estimator, ambiguity):
+        if ambiguity is not None and finding.kind == 'ambiguous_map':
+            start_s, end_s = map(run.seconds_until, (ambiguity.since_ns, ambiguity.until_ns))
+            yield replace(finding, start_s=start_s, end_s=end_s)
+        else:
+            yield finding
+    nis = None if result.recorder is None else result.recorder.mean_nis
+    yield from of_fit(None if nis is None else math.sqrt(nis))
+    if run.in_known_map and estimator.settings.localization_mode != 'off':
+        yield from of_map(counts, is_start_given=estimator.settings.set_initial_pose)
+    # These were logged when they happened.
+    yield from of_left_out(counts, Level.NOTE)
+    for name in UNEXPECTED_POSES:
+        if counts[name]:
+            yield replace(found(name), level=Level.NOTE)
+
+
+PLACE_THE_SENSOR = (
+    '--set sensor_pose=[X,Y,Z,ROLL,PITCH,YAW] places a sensor that is not on /tf, '
+    '--base-frame names another frame of the robot'
+)
+"""What to do where /tf does not connect sensor and robot."""
+
+MAX_CLOCK_OFFSET_S = ObserverNodeSettings.max_clock_offset
+
+MAX_AHEAD_S = 0.05
+"""A message can be late, but not early."""
+
+MAX_SILENCE = 0.1
+"""Share of the time beyond which velocities that are missing are more than a pause."""
+
+MAX_END_SILENCE = 1.0 / 3.0
+"""Share of the time after which landmarks that come no more are more than out of view."""
+
+FEWEST = 10
+"""Messages that a topic of landmarks has at least if it can be said to have ended."""
+
+
+def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[str]:
+    """Count the messages that did not become events, by reason."""
+    malformed = sum(recording.malformed[topic.name] for topic in selected.inputs)
+    return recording.dropped + Counter({MALFORMED: malformed})
+
+
+def of_use(
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings, run: Replay
+) -> Iterator[Finding]:
+    """Judge whether velocities and observations, and an Imu's angular ones, were of use."""
+    counts = run.estimator.counts
+    dropped = run.estimator.dropped + unused_messages(recording, selected)
+    # In a loaded map there may be none as its pose was not found, which is refused by itself.
+    is_lost = counts['observed_point'] > 0 and not run.estimator.is_localised
+    if not (run.observations > 0 or is_lost):
+        unused = Counter({'without a point that is used': counts['observation']}) + Counter(
+            {f'points {reason.words}': counts[reason.value] for reason in Reason}
+        )
+        finding = found(
+            'no_observation' if counts['velocity'] else 'nothing_used',
+            dropped=list_dropped(unused + dropped),
+        )
+        is_unplaced, remedy = recording.dropped[NO_TRANSFORM] > 0, ''
+        if clocks := next(of_clocks(recording, selected), None):
+            remedy = f'{clocks.what}: {clocks.remedy}'
+        elif is_unplaced or not unused + dropped:
+            missing = recording.contents.missing_tags(selected, inputs.tag_frame_prefix)
+            remedy = missing or (PLACE_THE_SENSOR if is_unplaced else '')
+        yield replace(finding, remedy=remedy or finding.remedy)
+    elif not counts['velocity']:
+        yield found('no_velocity', dropped=list_dropped(dropped))
+    if selected.imu is not None and not run.angular_velocities:
+        yield found(
+            'no_angular_velocity',
+            topic=selected.imu.name,
+            dropped=list_dropped(dropped),
+            instead=selected.velocity.name,
+        )
+
+
+def of_recording(
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings, run: Replay
+) -> Iterator[Finding]:
+    """Judge what was read, to its end: damage, stamps, and an odometry's poses."""
+    if run.resets:
+        seconds = run.seconds_until(run.estimator.stamp_ns or 0)
+        yield found('clock_jumped', seconds=seconds, count=run.resets)
+    if recording.loss and not recording.warning:
+        yield found('damaged', path=recording.path, loss=recording.loss)
+    yield from of_stamps(recording.unstamped)
+    yield from of_publishers(recording, selected, inputs)
+    if inputs.velocity_source == POSE_DIFFERENCES:
+        return
+    # Where the motion is, if an odometry's velocities are not how its poses move.
+    poses, velocity = run.dead_reckoning.poses, selected.velocity
+    stands_still = len(poses) > 1 and bool((poses == poses[0]).all())
+    if stands_still and recording.contents.poses_move(velocity):
+        yield found('zero_twist', topic=velocity.name)
+    elif not stands_still:
+        problem = recording.contents.twist_problem(velocity, selected.imu is None)
+        if problem:
+            yield found('wrong_twist', topic=velocity.name, problem=problem)
+
+
+def of_publishers(
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings = InputSettings()
+) -> Iterator[Finding]:
+    """Say on which of the topics of velocities more than one publishes, by what is on them."""
+    decoders = input_decoders(selected, replace(inputs, velocity_source='twist'))
+    for topic in (selected.velocity, selected.imu):
+        if topic is not None:
+            signs = recording.contents.signs_of_rivals(topic, decoders[topic])
+            if signs:
+                yield found('several_publishers', count=2, names=signs, topic=topic.name)
+
+
+def of_timing(recording: Recording, selected: SelectedTopics) -> Iterator[Finding]:
+    """Say which inputs of a recording, read to its end, were silent or are of another clock."""
+    names = [topic.name for topic in selected.inputs]
+    known = recording.arrivals
+    inputs = {name: known[name] for name in names if name in known and len(known[name])}
+    if not inputs:
+        return
+    start_s, end_s = min(each.first_s for each in inputs.values()), recording.end_s
+    duration_s = end_s - start_s
+    velocity, landmarks = selected.velocity.name, selected.landmarks.name
+    held = [('velocity', velocity, 'the pose was held, but for what landmarks say')]
+    if selected.imu is not None:
+        held.append(('angular velocity', selected.imu.name, f'that of {velocity} was taken'))
+    for input_name, topic, consequence in held:
+        if topic not in inputs:
+            continue
+        silence_s = inputs[topic].silence_s(start_s, end_s)
+        if silence_s > MAX_SILENCE * duration_s:
+            yield found(
+                'silence',
+                input=input_name,
+                topic=topic,
+                silence_s=silence_s,
+                duration_s=duration_s,
+                consequence=consequence,
+            )
+    if landmarks in inputs and len(inputs[landmarks]) >= FEWEST:
+        last_s = inputs[landmarks].last_s
+        silence_s = end_s - last_s
+        if silence_s > MAX_END_SILENCE * duration_s:
+            finding = found(
+                'landmarks_end', topic=landmarks, silence_s=silence_s, duration_s=duration_s
+            )
+            yield replace(finding, start_s=last_s - start_s, end_s=duration_s)
+    yield from of_clocks(recording, selected)
+
+
+def of_clocks(recording: Recording, selected: SelectedTopics) -> Iterator[Finding]:
+    """Say which inputs have stamps of the future, of 1970, or far from the velocity's."""
+    read = recording.arrivals
+    inputs = {t.name: read[t.name] for t in selected.inputs if len(read.get(t.name, ()))}
+    of_1970 = [name for name, arrivals in inputs.items() if arrivals.counts_from_start]
+    if 0 < len(of_1970) < len(inputs):  # else all are of a simulation
+        yield found('stamps_of_1970', topics=' and '.join(of_1970))
+        return
+    names = list(inputs)
+    for name in names[:1]:
+        if inputs[name].ahead_s > MAX_AHEAD_S:
+            yield found('early_stamps', topic=name, ahead_s=inputs[name].ahead_s)
+    for name in names[1:]:
+        arrivals, first_name, first = inputs[name], names[0], inputs[names[0]]
+        behind_s = arrivals.behind_s(first)
+        is_early = min(arrivals.ahead_s, -behind_s) > MAX_AHEAD_S
+        if is_early or abs(behind_s) > MAX_CLOCK_OFFSET_S:
+            side = 'behind' if behind_s > 0.0 else 'ahead of'
+            yield found(
+                'other_clock', topic=name, offset_s=abs(behind_s), side=side, other=first_name
+            )
+
+
+MAX_GROWTHS = 3
+GROWTH_SHARE = 0.25
+"""Part of the largest error that a growth must reach to be named."""
+
+NOTABLE_GAP_S = 0.5
+"""Time without a used landmark that is named where the error grew."""
+
+MAX_ANEES = 1.5
+"""ANEES beyond which the noise that is stated does not fit."""
+
+WINDOW_NS = 5 * NANOSECONDS_PER_SECOND
+"""Motions that are compared: long enough that the truth's own noise is small beside theirs."""
+
+MIN_WINDOWS = 20
+
+TOO_LITTLE = 1.5
+"""Errors over what is stated, beyond which a noise figure is named."""
+
+LONG_S = 1.0
+"""Time without landmarks after which an innovation is mostly due to the motion."""
+
+MIN_DEGREES = 60
+"""Degrees of freedom of innovations whose mean says something."""
+
+
+def of_errors(result: Result) -> Iterator[Finding]:
+    """Judge where the error grew, and which noise explains less than what is seen."""
+    yield from _of_growth(result)
+    if result.accuracy.anees is not None and result.accuracy.anees > MAX_ANEES:
+        yield found(
+            'overconfident_pose',
+            factor=np.sqrt(result.accuracy.anees),
+            anees=result.accuracy.anees,
+        )
+    if result.errors is not None:
+        yield from _of_axes(result)
+    yield from _of_gaps(result.innovations)
+
+
+def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int, int]]:
+    """Return rows (first, last) between which the error rose the most, without overlaps."""
+    if len(seconds) < 2:
+        return []
+    window_s = max(10.0, (seconds[-1] - seconds[0]) / 40.0)
+    ends = np.minimum(np.searchsorted(seconds, seconds + window_s), len(seconds) - 1)
+    rises = errors_m[ends] - errors_m
+    found: list[tuple[int, int]] = []
+    for start in np.argsort(-rises).tolist():
+        end = int(ends[start])
+        if rises[start] < GROWTH_SHARE * errors_m.max() or len(found) == MAX_GROWTHS:
+            break
+        if all(end <= other_start or start >= other_end for other_start, other_end in found):
+            found.append((start, end))
+    return [_trimmed(errors_m, start, end) for start, end in found]
+
+
+def _trimmed(errors_m: FloatArray, start: int, end: int) -> tuple[int, int]:
+    """Return the rows of the largest error in a window, and of the least one before it."""
+    largest = start + int(np.argmax(errors_m[start : end + 1]))
+    return start + int(np.argmin(errors_m[start : largest + 1])), largest
+
+
+def _of_growth(result: Result) -> list[Finding]:
+    if result.errors is None:
+        return []
+    seconds = result.seconds(result.errors.estimate.stamps_ns)
+    errors_m = np.linalg.norm(result.errors.errors[:, 3:], axis=1)
+    return [
+        replace(
+            found(
+                'error_growth',
+                before_m=errors_m[start],
+                after_m=errors_m[end],
+                start_s=seconds[start],
+                end_s=seconds[end],
+                circumstances=_circumstances(result, result.errors, start, end),
+            ),
+            start_s=float(seconds[start]),
+            end_s=float(seconds[end]),
+        )
+        for start, end in growth_windows(seconds, errors_m)
+    ]
+
+
+def _circumstances(result: Result, errors: TrajectoryErrors, start: int, end: int) -> str:
+    """Say what was seen, and how the robot moved, from one row of the errors to another."""
+    poses = errors.truth.poses[start : end + 1]
+    stamps_ns = errors.estimate.stamps_ns[[start, end]]
+    innovations = result.innovations
+    during = (innovations.stamps_ns >= stamps_ns[0]) & (innovations.stamps_ns <= stamps_ns[1])
+    used = int(np.count_nonzero(during & (innovations.weights > 0.0)))
+    gated = int(np.count_nonzero(during & (innovations.weights == 0.0)))
+    bounds_s = result.seconds(stamps_ns)
+    driven_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+    turns = so3.log(poses[1:, :3, :3] @ poses[:-1, :3, :3].swapaxes(-1, -2))
+    turned_deg = np.degrees(np.linalg.norm(turns, axis=1).sum())
+    seen = f'{used} observations of landmarks were used' if used else 'no landmark was used'
+    blind = _blind(result, *bounds_s.tolist())
+    rejected = f', {gated} rejected' if gated else ''
+    return (
+        f'{seen}{blind}{rejected}, while the robot drove {driven_m:.1f} m and turned '
+        f'by {turned_deg:.0f}°'
+    )
+
+
+def _blind(result: Result, start_s: float, end_s: float) -> str:
+    """Say how long nothing was used at a time, between two times; '' if that is usual."""
+    if len(result.gaps_s):
+        overlaps_s = np.ptp(np.clip(result.gaps_s, start_s, end_s), axis=1)
+        first_s, last_s = result.gaps_s[int(np.argmax(overlaps_s))]
+        if overlaps_s.max() >= 0.5 * (end_s - start_s):
+            return f' (none for {last_s - first_s:.0f} s, from {first_s:.0f} to {last_s:.0f} s)'
+    used_s = result.used_s[(result.used_s > start_s) & (result.used_s < end_s)]
+    longest_s = float(np.diff(np.concatenate([[start_s], used_s, [end_s]])).max())
+    return f' (none for up to {longest_s:.1f} s)' if longest_s >= NOTABLE_GAP_S else ''
+
+
+def _of_axes(result: Result) -> Iterator[Finding]:
+    """Judge the noise of each axis of the motion by the true motion."""
+    ratios = motion_ratios(result)
+    if ratios is None:
+        return
+    for axis in (2, 3, 4) if result.settings.two_d_mode else range(6):
+        ratio = float(ratios[axis])
+        if ratio > TOO_LITTLE:
+            kind, motion = ('angular', 'turns') if axis < 3 else ('linear', 'ways')
+            yield found(
+                'axis_noise',
+                turn_or_way=kind,
+                axis='xyz'[axis % 3],
+                ratio=significant(ratio, 2),
+                motion=motion,
+            )
+
+
+def motion_ratios(result: Result) -> FloatArray | None:
+    """Return how large the errors of the motion are for what is stated: (6,), angular first.
+
+    Of each axis, over windows of 5 s, less a constant scale and bias. None if there are too few.
+    """
+    true, measured = _motions(result)
+    if len(true) < MIN_WINDOWS:
+        return None
+    window_s = to_s(WINDOW_NS)
+    errors = se3.log(se3.inverse(true) @ measured)
+    motions = se3.log(true)
+    left = np.array([_without_calibration(motions[:, axis], errors[:, axis]) for axis in range(6)])
+    s = result.settings
+    density = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
+    scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
+    stated = density**2 * window_s + (scale * motions) ** 2 / window_s
+    # A turn within a window moves its end sideways: half-way on average.
+    way_squared = np.sum(motions[:, 3:] ** 2, axis=1, keepdims=True)
+    stated[:, 3:] += way_squared / 3.0 * stated[:, :3].sum(axis=1, keepdims=True)
+    means = stated.mean(axis=0)
+    return np.asarray(np.sqrt(np.mean(left.T**2, axis=0) / np.where(means > 0.0, means, np.inf)))
+
+
+def _motions(result: Result) -> tuple[FloatArray, FloatArray]:
+    """Return true and measured motions (w, 4, 4) of windows that both cover."""
+    truth = Trajectory(result.truth.stamps_ns, result.truth.poses)
+    delay_s = next((p.value for p in result.calibration if p.name == 'velocity_delay'), 0.0)
+    first, last = result.run.dead_reckoning.stamps_ns[[0, -1]].tolist()
+    edges_ns = np.arange(first, last, WINDOW_NS, dtype=np.int64)
+    true, is_true = interpolate(truth, edges_ns)
+    delay_ns = round(delay_s * NANOSECONDS_PER_SECOND)
+    measured, is_measured = interpolate(result.run.dead_reckoning, edges_ns - delay_ns)
+    both = is_true & is_measured
+    usable = both[1:] & both[:-1]
+    return (
+        (se3.inverse(true[:-1]) @ true[1:])[usable],
+        (se3.inverse(measured[:-1]) @ measured[1:])[usable],
+    )
+
+
+def _without_calibration(motions: FloatArray, errors: FloatArray) -> FloatArray:
+    """Return errors (w,) less what a constant scale and a bias explain of them."""
+    design = np.column_stack([motions, np.ones(len(motions))])
+    fit, *_ = np.linalg.lstsq(design, errors, rcond=None)
+    left: FloatArray = errors - design @ fit
+    return left
+
+
+def _of_gaps(innovations: Innovations) -> Iterator[Finding]:
+    """Judge the innovations after a time without landmarks, and the others."""
+    since_s = np.diff(to_s(innovations.update_stamps_ns), prepend=np.nan)
+    of_points = _ratio(innovations, since_s <= LONG_S)
+    of_motion = _ratio(innovations, since_s > LONG_S)
+    if of_points > TOO_LITTLE:
+        yield found('point_noise', ratio=significant(of_points, 2))
+    # What points explain is part of all innovations.
+    if of_motion > TOO_LITTLE * max(of_points, 1.0):
+        yield found('motion_noise', gap_s=LONG_S, ratio=significant(of_motion, 2))
+
+
+def _ratio(innovations: Innovations, is_chosen: BoolArray) -> float:
+    """Return how large innovations are for what is stated; 1 where they are too few."""
+    known = is_chosen & (innovations.degrees_of_freedom > 0)
+    total = int(innovations.degrees_of_freedom[known].sum())
+    if total < MIN_DEGREES:
+        return 1.0
+    return float(np.sqrt(np.nansum(innovations.nis[known]) / total))
