@@ -80,7 +80,7 @@ METRICS: dict[str, tuple[str, int]] = {
 }
 """Title and decimals of each table."""
 
-PRINTED_ONLY = ('heading_rmse_rad', 'landmark_rmse_m')
+PRINTED_ONLY = ('heading_rmse_rad', 'landmark_rmse_m', 'cpu_s')
 """Metrics whose tables the page does not have."""
 
 OUTLIERS_TITLE = 'Growth of the configuration error with 5 % gross outliers and 1 % swapped ids'

@@ -256,18 +256,18 @@ def two_tables(name: str, parameters: Sequence[Parameter]) -> dict[str, str]:
 def parameter_table(parameters: Iterable[Parameter]) -> str:
     """Return the table of parameters."""
     rows = [
-        (f'`{row.name}`', f'`{default_text(row)}` {row.unit}'.strip(), allowed(row), text(row))
+        (f'`{row.name}`', f'`{default_text(row)}` {row.unit}{allowed(row)}', text(row))
         for row in parameters
     ]
-    return markdown(('parameter', 'default', 'allowed', 'what it is'), rows)
+    return markdown(('parameter', 'default (allowed)', 'what it is'), rows)
 
 
 def allowed(row: Parameter) -> str:
-    """Return the choices, or the smallest and the largest value."""
+    """Return the choices, or the smallest and the largest value, in brackets."""
     if row.choices:
-        return ', '.join(row.choices)
+        return f' ({", ".join(row.choices)})'
     ends = [f'{end:g}' if math.isfinite(end) else '' for end in (row.minimum, row.maximum)]
-    return '…'.join(ends) if any(ends) else ''
+    return f' ({"…".join(ends)})' if any(ends) else ''
 
 
 def default_text(row: Parameter) -> str:
