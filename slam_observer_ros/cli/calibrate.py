@@ -378,7 +378,7 @@ COMMON_SCALE = Trade(
 
 def trades(parts: Sequence[CalibrationEstimate], correlations: FloatArray) -> list[Trade]:
     """Return the pairs among parts (c,) that can't be distinguished, the closest first."""
-    unknown = np.array([part.deviation > WELL_KNOWN * part.stated for part in parts])
+    unknown = np.array([p.deviation > WELL_KNOWN * p.stated for p in parts], dtype=np.bool_)
     close = np.triu(np.abs(correlations) > MUCH, 1) & unknown & unknown[:, None]
     found = []
     for i, j in np.argwhere(close).tolist():
