@@ -250,8 +250,8 @@ T = TypeVar('T')
 SURE, CLEAR = 25.0, 0.05
 """ln of how many times likelier all points must be, and each on average."""
 
-STRETCH_NS, FEW_EVENTS = to_ns(5.0), 4
-"""Stretches of a drive, and of how many all would be likelier if what helps were events.
+STRETCH_NS, THROUGHOUT = to_ns(5.0), 0.25
+"""Stretches of a drive, and the share of them that is likelier at least if a mistake explains it.
 
 N gains that are equal, among others that are nothing, have a sum of √N times their norm.
 """
@@ -452,7 +452,8 @@ class _Score:
         edges = np.arange(np.min(ends_ns), np.max(ends_ns) + STRETCH_NS + 1, STRETCH_NS)
         (one, counts), (another, other_counts) = (each._stretches(edges) for each in (self, other))
         gains = np.minimum(counts, other_counts) * (one - another)
-        return bool(gains.sum() > math.sqrt(FEW_EVENTS * np.square(gains).sum()))
+        least = THROUGHOUT * np.count_nonzero(gains) * np.square(gains).sum()
+        return bool(gains.sum() > math.sqrt(least))
 
     def _stretches(self, edges_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean, and how many observations with new errors, between stamps (m + 1,)."""
