@@ -129,8 +129,8 @@ class HallRobot(Node):  # type: ignore[misc]  # rclpy comes untyped
 
     def carry(self) -> None:
         """Put the robot down on the other side of the lap, which its wheels don't notice."""
-        self._carried_s = self.time_s
-        self._truth = self._true_pose(self.time_s)
+        self._carried_s = self.time_s + 0.5 / ODOMETRY_HZ  # what it has published is from before
+        self._truth = self.world.true_pose(self.time_s + 0.5 * self.world.lap_s)
 
     def _true_pose(self, time_s: float) -> FloatArray:
         ahead_s = 0.5 * self.world.lap_s if time_s >= self._carried_s else 0.0
