@@ -33,9 +33,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
     [
         [],
         ['--keep-pose'],
-        ['--reflectors'],
         ['--reflectors', '--carried'],
-        ['--floor-codes'],
         ['--floor-codes', '--carried'],
         ['--uwb'],
     ],

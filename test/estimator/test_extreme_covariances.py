@@ -58,7 +58,7 @@ def run(settings: Settings, stated: str, shape: str, size: float) -> None:
         estimator.load_map(LandmarkMap(IDS, WORLD, covariances, np.zeros(len(IDS), dtype=int)))
     if stated == 'start' and is_right:
         estimator.set_pose(pose, shaped(shape, size, 6))
-    for step in range(12):
+    for step in range(7):
         stamp_ns = (step + 1) * PERIOD_NS
         estimator.add(VelocityEvent(stamp_ns, body_velocity, of_velocity))
         pose = pose @ se3.exp(0.1 * body_velocity)

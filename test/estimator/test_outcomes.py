@@ -45,7 +45,7 @@ def events(rng, seconds=6):
     [{}, {'gains': 'constant'}, {'max_landmarks': 5}, {'max_points': 6}, {'max_hypotheses': 1}],
     ids=str,
 )
-@hypothesis_settings(max_examples=8)
+@hypothesis_settings(max_examples=4)
 @given(rng=generators())
 def test_each_observed_point_is_used_or_has_exactly_one_reason(change, rng):
     updates = []

@@ -190,7 +190,7 @@ def assert_same(compressed, dense, tolerance=1e-9):
     [PLAIN, CALIBRATED, PLANAR, TAGS, PLANAR_TAGS],
     ids=['3D', '3D, c̃', 'planar', 'tags', 'planar tags'],
 )
-@suite(max_examples=5)
+@suite(max_examples=2)
 @given(generators())
 def test_compressed_covariance_is_the_dense_one(settings, rng):
     """Over a loop and its closing, landmarks removed and relocated."""
@@ -205,7 +205,7 @@ def test_compressed_covariance_is_the_dense_one(settings, rng):
     assert not filters[0].joint.is_dense
 
 
-@suite(max_examples=5)
+@suite(max_examples=2)
 @given(generators())
 def test_copies_share_what_is_large_and_change_apart(rng):
     filters, world = pair(PLAIN), World(rng, PLAIN)
@@ -226,7 +226,7 @@ def test_copies_share_what_is_large_and_change_apart(rng):
     [CALIBRATED, PLANAR, TAGS, PLANAR_TAGS],
     ids=['3D', 'planar', 'tags', 'planar tags'],
 )
-@suite(max_examples=5)
+@suite(max_examples=2)
 @given(generators())
 def test_known_maps_poses_that_are_set_and_known_landmarks_that_anchor(settings, rng):
     filters, world = pair(settings), World(rng, settings)

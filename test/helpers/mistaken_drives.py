@@ -49,7 +49,7 @@ def surveyed(seed=0):
     return LandmarkMap(np.arange(25), points, covariances, np.zeros(25, dtype=np.int64))
 
 
-def drive(seed=0, seconds=60.0, false=0.0):
+def drive(seed=0, seconds=30.0, false=0.0):
     """Events of a robot that drives an eight among landmarks, as noisy as stated."""
     rng, events, A = np.random.default_rng(seed), [], np.eye(4)
     landmarks = landmarks_of(rng)
@@ -59,7 +59,7 @@ def drive(seed=0, seconds=60.0, false=0.0):
         noise = np.array([0.0, 0.0, 0.02, 0.02, 0.0, 0.0]) * rng.normal(size=6) / math.sqrt(dt_s)
         events.append(VelocityEvent(stamp_ns - PERIOD_NS, V + noise))
         A = A @ se3.exp(dt_s * V)
-        if step % 4:
+        if step % 8:
             continue
         points = se3.transform(se3.inverse(A), landmarks)
         ranges_m, bearings = np.linalg.norm(points, axis=1), np.arctan2(points[:, 1], points[:, 0])

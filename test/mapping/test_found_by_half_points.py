@@ -111,7 +111,7 @@ def test_a_robot_that_knows_nothing_is_found_within_a_short_drive(kinds, seed):
     assert hall.estimator.localisation_problem is None
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('kind', [RANGE, BEARING, AZIMUTH_RANGE])
 def test_in_space_it_is_found_as_well(kind, seed):
     hall = Hall(seed, SPACE)
@@ -126,8 +126,7 @@ def test_ranges_through_walls_do_not_mislead_it(seed):
     assert off_m is not None and off_m < 0.05 * hall.size_m
 
 
-@pytest.mark.parametrize('turns', [True, False])
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize(('seed', 'turns'), [(0, True), (1, True), (2, False), (3, False)])
 def test_ranges_from_anchors_in_a_line_leave_the_side_open(seed, turns):
     hall = Hall(seed, in_a_line=True, turns=turns)
     assert hall.drive([RANGE]) is None

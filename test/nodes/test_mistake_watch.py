@@ -37,7 +37,7 @@ def searched(watched, node):
 
 
 def test_a_mistake_is_named_once_in_the_log_and_stays_a_finding():
-    watched, node = watch(MADE['turning_in_degrees'].apply(drive(seconds=40.0)))
+    watched, node = watch(MADE['turning_in_degrees'].apply(drive(seconds=25.0)))
     watched.look(SLIP, has_slipped=False)
     assert searched(watched, node) > 10
     assert [each.kind for each in watched.findings] == ['turning_in_degrees']
@@ -84,7 +84,7 @@ def test_a_node_names_it_on_diagnostics_in_place_of_its_symptoms(ros, tmp_path):
         return received[-1].status[0].message if received else ''
 
     with running('observer_node', tmp_path / 'log', **parameters) as node, Robot(ros) as robot:
-        for event in MADE['turning_negated'].apply(drive(seconds=50.0)):
+        for event in MADE['turning_negated'].apply(drive(seconds=30.0)):
             robot.send(event)
             ros.spin_for(0.002)
         ros.spin_until(lambda: 'angular velocity is negated' in message(), 'the mistake')

@@ -53,7 +53,7 @@ def settings_and_other(row, gains, **more):
 
 def events_of(settings, with_ids=True):
     """Events of a noisy run, in which every seventh point or so is far off, but at first none."""
-    world = drive(settings, 6.0, noise=1.5, landmarks=8, seen=5)
+    world = drive(settings, 4.5, noise=1.5, landmarks=8, seen=5)
     rng = np.random.default_rng(1)
 
     def disturb(index, event):
@@ -170,7 +170,7 @@ def test_a_changed_setting_is_in_force_in_a_loaded_map(row, gains, mode):
 def test_what_an_estimator_was_made_with_does_not_matter_after_a_change(row, gains, with_ids):
     """Nor how often it has changed: in the middle of a run, whatever has been estimated."""
     settings, other = settings_and_other(row, gains)
-    before, after = split_before_observation(events_of(settings, with_ids), 12)
+    before, after = split_before_observation(events_of(settings, with_ids), 8)
     changed, changed_twice = Estimator(settings), Estimator(other)
     changed_twice.change_settings(settings)
     add_all(before, changed, changed_twice)

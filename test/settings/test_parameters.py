@@ -200,6 +200,7 @@ def values_of(row):
 
 
 @pytest.mark.parametrize('row', table(Settings), ids=lambda row: row.name)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_what_is_in_range_is_taken(row, data):
     value = data.draw(values_of(row))
@@ -208,6 +209,7 @@ def test_what_is_in_range_is_taken(row, data):
 
 
 @pytest.mark.parametrize('row', table(Settings), ids=lambda row: row.name)
+@settings(max_examples=10)
 @given(junk)
 def test_whatever_is_given_there_are_settings_or_a_parameter_error(row, value):
     try:

@@ -51,8 +51,12 @@ problems = pytest.mark.parametrize(
         Problem(axes, c, seed, is_relative, drifts=drifts, tags=tags)
         for axes in (PLANAR, SPATIAL)
         for c, drifts in ((0, False), (2, False), (2, True))
-        for seed, tags in ((0, False), (1, False), (2, True))
-        for is_relative in (False, True)
+        for seed, tags, is_relative in (
+            (0, False, False),
+            (1, False, True),
+            (2, True, False),
+            (2, True, True),
+        )
     ],
 )
 
