@@ -375,6 +375,10 @@ class Estimator(Estimate):
                 self._half_points.clear()
                 # It is in the same map again later, unless there are several.
                 self._warnings.two_places.doubt(is_all=len(self._localiser.maps) > 1)
+            elif was_localised and (loaded := self._localiser.loaded) is not None:
+                known = loaded.ids, loaded.covariances
+                if self._hypotheses.follow_drift(event, update, *known):
+                    self._timeline.velocities.doubt_standing()
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
             is_alone = len(self._hypotheses) == 1

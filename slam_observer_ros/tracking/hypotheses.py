@@ -49,7 +49,8 @@ from slam_observer_ros.tracking.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.tracking.matching import calibrated, match, MatchedObservation
-from slam_observer_ros.tracking.standing import MAX_MOTIONS, Standing, take_back
+from slam_observer_ros.tracking.slip import stray
+from slam_observer_ros.tracking.standing import Drift, MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.step import step
 
@@ -100,7 +101,7 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._new_landmarks = NewLandmarks()
-        self._standing = Standing()
+        self._standing, self._drift = Standing(), Drift()
         self._velocities: VelocityHistory | None = None  # along which they were moved
         self._delay_evidence = DelayEvidence()
         self._present: Ambiguity | None = None
@@ -147,6 +148,7 @@ class Hypotheses:
 
     def prune_to_best(self) -> State:
         """Give up all hypotheses but the most likely one, and return its state."""
+        self._drift.clear()
         self._all = self._all[:1]
         return self.best
 
@@ -271,6 +273,7 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.state.clear_time()
         self._standing.clear_time()
+        self._drift.clear()
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
@@ -302,9 +305,32 @@ class Hypotheses:
                 counts = hypothesis.state.counts
                 counts.note(Reason.CARRIED, event.ids[is_carried], event.stamp_ns)
             event = event.select(~is_carried)
+        if self._drift.is_followed:
+            self._drift.covariance = self.best.known_errors.pose_covariance()
         update = self._observe(event)
         self._note_ambiguity(event)
         return update
+
+    def follow_drift(
+        self,
+        event: ObservationEvent,
+        update: Update,
+        known_ids: IntArray,
+        known_covariances: FloatArray | None,
+    ) -> bool:
+        """Let the pose be uncertain if an observation and those before it contradict it.
+
+        By the landmarks of a loaded map, as :meth:`.Drift.note`; return whether they do.
+        """
+        best, drift = self.best, self._drift
+        if not self._can_weigh:
+            return False
+        has_strayed = drift.note(best, event, update, known_ids, known_covariances)
+        if has_strayed:
+            drift.clear()
+            for hypothesis in self._all:
+                stray(hypothesis.state, update)
+        return has_strayed
 
     def _note_ambiguity(self, event: ObservationEvent) -> None:
         """Note whether points without ids fit several maps, after an observation."""

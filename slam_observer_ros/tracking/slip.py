@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.filter.robust import huber_loss
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import (
@@ -40,6 +41,9 @@ ITERATIONS = 10
 MIN_VARIANCE = 1e-6
 """Least variance of a motion without odometry, rad² or m²."""
 
+LEAST_S = 1.0
+"""For how long odometry is taken to have been wrong where a robot has strayed, at least."""
+
 
 def slip(state: State, matched: MatchedObservation) -> float:
     """Let the robot have slipped to where it sees these landmarks; return the cost of the motion.
@@ -49,7 +53,8 @@ def slip(state: State, matched: MatchedObservation) -> float:
     """
     # The noise of a motion without odometry, for as long as it takes, to where landmarks put it.
     observer, start = state.observer, state.observer.A.copy()
-    needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
+    points, r = matched.known.points, matched.residuals.r
+    needed_s = min(_needed_s(state, points, r), MAX_DURATION_S)
     noise = _noise(state, needed_s)
     variances = np.maximum(np.diagonal(noise)[state.axes.pose], MIN_VARIANCE)
     state.slip(_pose_after(state, matched, variances), noise)
@@ -73,13 +78,15 @@ def _noise(state: State, duration_s: float) -> FloatArray:
     return np.asarray(state.motion_noise.covariances(stray)[0])
 
 
-def _duration_s(state: State, matched: MatchedObservation) -> float:
-    """Return how long a robot without odometry would take to get there, seconds."""
-    settings, k, residuals = state.settings, state.axes.point, matched.residuals
-    points = matched.known.points
+def _needed_s(state: State, points: FloatArray, r: FloatArray) -> float:
+    """Return how long a robot without odometry would take to get there, seconds.
+
+    By residuals r (m, k) of ``points`` (m, 3) in the body frame.
+    """
+    settings, k = state.settings, state.axes.point
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
-    needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE)
+    needed_s = np.sum(r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE)
     return float(np.mean(needed_s))
 
 
@@ -116,3 +123,15 @@ def _likeliest_pose(
         gradient = strayed / variances + np.sum(CW @ left, axis=0)[:, 0]
         found = found @ se3.exp(-axes.full_pose(solve_symmetric(H, gradient)))
     return found
+
+
+def stray(state: State, update: Update) -> None:
+    """Let the pose be as uncertain as if odometry had said nothing for a second, or longer.
+
+    For as long as what is seen takes. What the views do not show has been off for as long.
+    """
+    rows = state.landmarks.rows_of(update.ids)
+    points = state.observer.body_points(rows[rows >= 0])
+    needed_s = _needed_s(state, points, update.residuals[rows >= 0])
+    state.slip(state.observer.A, _noise(state, min(max(needed_s, LEAST_S), MAX_DURATION_S)))
+    state.counts['slip'] += 1

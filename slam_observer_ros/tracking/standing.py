@@ -3,7 +3,7 @@
 If all landmarks do, the robot stands and its wheels spin: each observation is off by too little to
 be rejected, and pose and landmarks would be dragged along. So would they if it turns and slides.
 If some landmarks do, while others pass as odometry has it, the robot carries them along: they are
-not places.
+not places. In a loaded map a robot that is pushed shows in several views together: :class:`Drift`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ import math
 import numpy as np
 from scipy.linalg import block_diag
 
-from slam_observer_ros.common.stamps import to_ns
-from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.common.stamps import to_ns, to_s
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.lie import se3
+from slam_observer_ros.filter.arrays import SeenOrientations
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import (
     mahalanobis,
     solve_symmetric,
@@ -27,8 +29,12 @@ from slam_observer_ros.lie.matrices import (
     with_blocks,
 )
 from slam_observer_ros.models.integration import integrate
+from slam_observer_ros.models.observation_noise import repetition_factors
 from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.tracking import covariances
+from slam_observer_ros.tracking.matching import calibrated
 from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.step import seen_orientations
 
 SLIPS = (np.zeros(6), np.repeat([1.0, 0.0], 3))
 """Shares (6,) of a motion that are made where wheels spin: nothing, or the turn alone."""
@@ -74,6 +80,15 @@ UNSEEN_NS = to_ns(1.0)
 
 MAX_MOTIONS = 500
 """Motions between observations that are remembered."""
+
+LASTING_SHARE = 0.95
+"""Of what views before count, at most: views within milliseconds have an error in common."""
+
+RECENT_S, PAUSE_S = 0.3, 1.0
+"""Time, seconds, after which a view counts for a third; and after which none before it counts.
+
+A robot that is pushed is then noticed before a second is over.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -460,6 +475,109 @@ class Standing:
         evidence = self._evidence = {i: much for i, much in self._evidence.items() if much}
         self.carried = {i for i, much in evidence.items() if much == CERTAIN or i in self.carried}
         self.excluded = self.carried | {i for i, much in evidence.items() if much >= CLEAR**2}
+
+
+class Drift:
+    """Whether the last views together put the robot where it can't be, each being within the gate.
+
+    With C_i = [−[ȳ_i]×, I] about the robot, an error ε of its pose gives landmarks of a map the
+    residuals r_i = C_i ε + noise, and the turns of tags C = [I, 0]. g = Σ Cᵀ R⁻¹ r over the last
+    views is then H ε + noise of the covariance V, H = Σ Cᵀ R⁻¹ C, and rarely larger than
+    S = H P H + V says. R is the noise while driving: what lasts while the robot stands is in all
+    of its views, and no news. The map's errors are the same in each of the last views.
+    """
+
+    def __init__(self) -> None:
+        self.is_followed = False  # nowhere but in a map
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin again, as the pose has changed otherwise."""
+        self.covariance: FloatArray | None = None  # (6, 6) of ε, before the present view
+        self._stamp_ns = 0
+        self._g, self._H, self._V = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
+
+    def note(
+        self,
+        state: State,
+        event: ObservationEvent,
+        update: Update,
+        known_ids: IntArray,
+        known_covariances: FloatArray | None,
+    ) -> bool:
+        """Take what an observation did; return whether the pose must be wrong by the last views.
+
+        Landmarks ``known_ids`` (n,) are in a map, with ``known_covariances`` (n, 3, 3), m², or
+        None if it is exact.
+        """
+        self.is_followed = True
+        elapsed_s = to_s(max(update.stamp_ns - self._stamp_ns, 0))
+        before, self.covariance = self.covariance, None
+        if elapsed_s > PAUSE_S:
+            self.clear()
+        self._stamp_ns = update.stamp_ns
+        # Which of the points seen, in the order of the event, were taken for a landmark.
+        seen = np.isin(event.ids, update.ids) | (event.ids == UNKNOWN_ID)
+        is_whole = event.kinds is None and np.count_nonzero(seen) == len(update.ids)
+        if before is None or not is_whole:
+            return False
+        rows, in_map = state.landmarks.rows_of(update.ids), known_ids == update.ids[:, None]
+        used = (rows >= 0) & ~update.rejected & in_map.any(axis=1)
+        if not used.any():
+            return False
+        event = replace(calibrated(state, event).select(seen).select(used), sensed=None)
+        rows, in_map = rows[used], in_map[used]
+        observer, pose = state.observer, state.axes.pose
+        P = covariances.of_pose(observer, before, observer.A)[pose, pose]
+        # Of each the sensor's error, as often as it is new, and the map's, for all of the views.
+        share = math.exp(-elapsed_s / RECENT_S)
+        views = 1.0 / (1.0 - min(share, LASTING_SHARE))
+        lasting = state.settings.observation_correlation_time
+        repeated = repetition_factors(np.array([elapsed_s]), lasting)
+        k, p, R = state.axes.point, state.axes.p, observer.pose[:3, :3]
+        noise = repeated * (R @ state.observation_noise.covariances(event) @ R.T)
+        if known_covariances is not None:
+            noise += views * known_covariances[in_map.argmax(axis=1)]
+        C = state.axes.output_matrix(observer.body_points(rows) @ R.T)
+        parts = [(C, noise[:, :k, :k], update.residuals[used, :k])]
+        if (tags := seen_orientations(state, event, rows)) is not None:
+            parts.append(_turned(state, tags, repeated, views))
+        H, g = share * self._H[:p, :p], share * self._g[:p]
+        V = share**2 * self._V[:p, :p]
+        for C, noise, r in parts:
+            # No view of one landmark says more than a few: it may be an outlier.
+            far = mahalanobis(r, noise + C @ P @ transpose(C))
+            r = np.minimum(1.0, CLEAR / np.maximum(far, CLEAR))[:, None] * r
+            CW = transpose(C) @ np.linalg.inv(noise)
+            h = np.sum(CW @ C, axis=0)
+            H, V, g = H + h, V + h, g + np.sum(CW @ r[:, :, None], axis=0)[:, 0]
+        self._g, self._H, self._V = g, H, V
+        S = H @ P @ H + V
+        # Along directions that no view has shown, both are zero.
+        scale = np.sqrt(np.maximum(np.diagonal(S), np.finfo(np.float64).tiny))
+        scaled = g / scale
+        inverse = np.linalg.pinv(S / np.outer(scale, scale), rcond=1e-9, hermitian=True)
+        return bool(scaled @ inverse @ scaled > CLEAR**2)
+
+
+def _turned(
+    state: State, tags: SeenOrientations, repeated: FloatArray, views: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return C (t, q, p), noise (t, q, q) and residuals (t, q) of tags' turns, about the world.
+
+    Of each tag the orientation counts that fits better, of two that look nearly the same.
+    """
+    known, R = state.observer.orientations, state.observer.pose[:3, :3]
+    tags = tags.select(tags.Z.any(axis=(1, 2)) & known.are_known[tags.rows])
+    B = state.observer.reference_pose[:3, :3] @ known.B[tags.rows]
+    both = so3.log(R @ np.array([tags.Z, tags.flipped]) @ transpose(B))
+    nearer = np.argmin(np.sum(both**2, axis=2), axis=0)
+    of_map = known.map_sigmas[tags.rows, None, None] ** 2 * np.eye(3)
+    noise = repeated * (R @ tags.covariances @ R.T) + views * of_map
+    axes, C = state.axes, np.zeros((len(tags.rows), state.axes.turn, state.axes.p))
+    C[:, :, : axes.turn] = np.eye(axes.turn)
+    turns = both[nearer, np.arange(len(nearer))]
+    return C, axes.turn_covariances(noise), axes.turns(turns)
 
 
 def take_back(state: State, lost: Lost) -> None:

@@ -11,6 +11,7 @@ import pytest
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.matrices import solve_symmetric
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -22,21 +23,27 @@ V = np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
 class Robot:
     """Drives in a map; wheels or hands may move it otherwise, and landmarks may be moved."""
 
-    def __init__(self, mode='fixed'):
+    def __init__(self, mode='fixed', tags=False, planar=False):
         settings = Settings(
             reorder_window=0.0,
+            use_tag_orientation=tags,
+            two_d_mode=planar,
             localization_mode=mode,
             observation_model='cartesian',
             point_noise=0.03,
         )
         self.estimator, self.rng = Estimator(settings), np.random.default_rng(0)
         counts, covariances = np.zeros(4, dtype=np.int64), np.tile(1e-4 * np.eye(3), (4, 1, 1))
-        known = LandmarkMap(np.arange(4), POINTS, covariances, counts)
+        turned = (np.tile(np.eye(3), (4, 1, 1)), np.full(4, 0.01)) if tags else (None, None)
+        known, self.tags = (
+            LandmarkMap(np.arange(4), POINTS, covariances, counts, 'm', *turned),
+            tags,
+        )
         self.estimator.load_map(known, np.eye(4), 1e-4 * np.eye(6))
         self.A, self.stamp_ns, self.points = np.eye(4), 0, POINTS.copy()
-        self.said = []
+        self.said, self.is_wrong = [], []
 
-    def run(self, seconds, rows, true=V):
+    def run(self, seconds, rows, true=V, V=V):
         """Go on, by odometry with V, and in truth otherwise; note what was said at each view."""
         for step in range(round(seconds * SECOND / PERIOD_NS)):
             self.estimator.add(VelocityEvent(self.stamp_ns, V))
@@ -45,8 +52,23 @@ class Robot:
             if step % 2:
                 seen = se3.transform(se3.inverse(self.A), self.points[rows])
                 seen += 0.01 * self.rng.normal(size=seen.shape)
-                self.estimator.add(ObservationEvent(self.stamp_ns, np.array(rows), seen))
+                R = np.broadcast_to(self.A[:3, :3].T, (len(rows), 3, 3)) if self.tags else None
+                event = ObservationEvent(self.stamp_ns, np.array(rows), seen, orientations=R)
+                self.estimator.add(event)
                 self.said.append(self.estimator.is_contradicted)
+                off = (self.estimator.pose[:3, 3] - self.A[:3, 3])[:2]
+                deviation = np.sqrt(off @ solve_symmetric(self.position_covariance, off))
+                self.is_wrong.append(deviation > 5.0 and not self.said[-1])
+
+    @property
+    def position_covariance(self):
+        return self.estimator.pose_covariance[3:5, 3:5]
+
+    @property
+    def longest_wrong_s(self):
+        """Longest time for which it was surely elsewhere, and was said to be where it is."""
+        runs = ''.join('x' if wrong else ' ' for wrong in self.is_wrong).split()
+        return max(map(len, runs), default=0) * 2 * PERIOD_NS / SECOND
 
 
 @pytest.mark.parametrize('mode', ['fixed', 'uncertain'])
@@ -121,3 +143,42 @@ def test_a_hall_in_which_the_ids_are_others_is_named_whichever_map_has_them(capl
     assert not estimator.is_localised
     assert 'as in the map a, which has other ids' in str(estimator.localisation_problem)
     assert len(caplog.messages) == 1
+
+
+STANDS, ON_THE_SPOT = np.zeros(6), np.array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0])
+SIDEWAYS, BACK = np.eye(6)[4], np.eye(6)[3] * -1.0
+
+
+@pytest.mark.parametrize(
+    ('odometry', 'true', 'rows'),
+    [
+        pytest.param(STANDS, 0.5 * SIDEWAYS, [0, 1, 2], id='pushed aside'),
+        pytest.param(STANDS, 0.3 * BACK, [0, 1, 2], id='pushed back'),
+        pytest.param(STANDS, 0.3 * BACK, [0], id='pushed back, one in view'),
+        pytest.param(V, V + 0.5 * SIDEWAYS, [0, 1, 2], id='pushed in a drive'),
+        pytest.param(0.5 * np.eye(6)[3], STANDS, [0], id='wheels spin, one in view'),
+        pytest.param(ON_THE_SPOT, STANDS, [0, 1, 2], id='wheels turn on the spot'),
+        pytest.param(ON_THE_SPOT, STANDS, [0], id='wheels turn on the spot, one in view'),
+    ],
+)
+@pytest.mark.parametrize('tags', [False, True], ids=['points', 'tags'])
+def test_a_robot_is_not_surely_elsewhere_for_longer_than_a_second(odometry, true, rows, tags):
+    robot = Robot('uncertain', tags, planar=True)
+    robot.run(3.0, [0, 1, 2, 3])
+    if not odometry.any():
+        robot.run(5.0, rows, STANDS, STANDS)
+    robot.run(2.0, rows, true, odometry)
+    robot.run(3.0, rows, odometry, odometry)
+    assert robot.longest_wrong_s <= 1.0
+    robot.run(3.0, [0, 1, 2, 3], STANDS, STANDS)
+    assert np.linalg.norm(robot.estimator.pose[:3, 3] - robot.A[:3, 3]) < 0.1
+
+
+@pytest.mark.parametrize('tags', [False, True], ids=['points', 'tags'])
+def test_a_robot_that_goes_as_its_wheels_say_does_not_slip(tags):
+    robot = Robot(tags=tags)
+    for _ in range(4):
+        robot.run(3.0, [0, 1])
+        robot.run(3.0, [0], STANDS, STANDS)
+        robot.run(3.0, [0, 1, 2], -V, -V)
+    assert robot.estimator.counts['slip'] == 0 and not any(robot.is_wrong)
