@@ -49,11 +49,6 @@ def read_text(path: Path) -> str:
         return content.decode('latin-1')
 
 
-def read_lines(path: Path) -> list[str]:
-    """Return the lines of a file, as :func:`read_text` reads it."""
-    return read_text(path).splitlines()
-
-
 _MARK = '.unfinished-'
 _DIRECTORY_MARK = f'.slam_observer{_MARK}'
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 import struct
-from typing import Any, cast, TypeAlias, TypeVar
+from typing import Any, cast, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +14,6 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 """One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""
-
-ReadT = TypeVar('ReadT')
 
 ENCAPSULATION_BYTES = 4
 MAX_PADDING_BYTES = 3
@@ -155,41 +151,16 @@ class CdrBlockReader(CdrReader):
         seconds = times[:, 0].astype(np.int32).astype(np.int64)
         return seconds * NANOSECONDS_PER_SECOND + times[:, 1].astype(np.int64)
 
-    def uint8(self) -> int:
-        """Read a byte that is the same in all messages."""
-        return self._common(super().uint8)
-
-    def uint16(self) -> int:
-        """Read a uint16 that is the same in all messages."""
-        return self._common(super().uint16)
-
-    def int32(self) -> int:
-        """Read an int32 that is the same in all messages."""
-        return self._common(super().int32)
-
-    def uint32(self) -> int:
-        """Read a uint32 that is the same in all messages."""
-        return self._common(super().uint32)
-
-    def string(self) -> str:
-        """Read a string that is the same in all messages."""
-        return self._common(super().string)
-
-    def data(self, size: int) -> memoryview:
-        """Read bytes that are the same in all messages."""
-        return self._common(partial(super().data, size))
+    def _take(self, size: int, alignment: int) -> int:
+        start = super()._take(size, alignment)
+        self._check_common(start, self._position)
+        return start
 
     def _numbers(self, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
         if count == 0:
             return np.zeros((len(self._rows), 0), dtype)
-        start = self._take(count * dtype.itemsize, dtype.itemsize)
+        start = super()._take(count * dtype.itemsize, dtype.itemsize)
         return np.ascontiguousarray(self._rows[:, start : self._position]).view(dtype)
-
-    def _common(self, read: Callable[[], ReadT]) -> ReadT:
-        begin = self._position
-        value = read()
-        self._check_common(begin, self._position)
-        return value
 
     def _check_common(self, begin: int, end: int) -> None:
         if (self._rows[:, begin:end] != self._rows[0, begin:end]).any():

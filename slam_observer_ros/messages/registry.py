@@ -103,7 +103,10 @@ class BlockDecoder:
         """
         if self._is_right is not False:
             try:
-                block = self._block(rows, receive_ns)
+                read = self._decode.block(rows, receive_ns)
+                stamps_ns, frame = cast('IntArray', read.stamp_ns), read.sensor_frame
+                measured = read.body_velocity, read.covariance
+                block = VelocityBlock(stamps_ns, *measured, receive_ns, frame)
             except (IndexError, TypeError, ValueError):
                 self._is_right = False
             else:
@@ -112,12 +115,6 @@ class BlockDecoder:
                 if self._is_right:
                     return block
         raise MessageError('messages of this type are read one by one')
-
-    def _block(self, rows: NDArray[np.uint8], receive_ns: IntArray) -> VelocityBlock:
-        read = self._decode.block(rows, receive_ns)
-        stamps_ns = cast('IntArray', read.stamp_ns)
-        velocities, covariances, frame = read.body_velocity, read.covariance, read.sensor_frame
-        return VelocityBlock(stamps_ns, velocities, covariances, receive_ns, frame)
 
     def _is_as_one_by_one(
         self, block: VelocityBlock, rows: NDArray[np.uint8], receive_ns: IntArray

@@ -5,7 +5,6 @@ The program of ``slam-observer doctor``: ``python -m slam_observer_ros.nodes.liv
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 import json
 import sys
@@ -141,27 +140,20 @@ def main() -> int:
 def _listen(node: Node, executor: SingleThreadedExecutor, seconds: float) -> list[HeardTopic]:
     """Return what is heard within some seconds once discovery had its time, or later."""
     topics: dict[tuple[str, str], HeardTopic] = {}
+    read = {*_read_types(), TRANSFORMS}
     look_s = time.monotonic() + DISCOVERY_S
     end_s = look_s + seconds
     while (now_s := time.monotonic()) < end_s:
         if now_s >= look_s:
             look_s = now_s + LOOK_PERIOD_S
-            for name, type_name in _usable_topics(node):
-                if (name, type_name) not in topics:
-                    topic = HeardTopic(name, type_name, end_s - now_s)
-                    topics[name, type_name] = topic
-                    _subscribe(node, topic)
+            for name, types in node.get_topic_names_and_types():
+                for type_name in read.intersection(types):
+                    if (name, type_name) not in topics and node.count_publishers(name):
+                        topic = HeardTopic(name, type_name, end_s - now_s)
+                        topics[name, type_name] = topic
+                        _subscribe(node, topic)
         executor.spin_once(timeout_sec=min(look_s, end_s) - now_s)
     return list(topics.values())
-
-
-def _usable_topics(node: Node) -> Iterator[tuple[str, str]]:
-    """Yield the topics, and their types, that somebody publishes and the node reads."""
-    read = _read_types()
-    for name, types in node.get_topic_names_and_types():
-        for type_name in types:
-            if type_name in (*read, TRANSFORMS) and node.count_publishers(name):
-                yield name, type_name
 
 
 def _subscribe(node: Node, topic: HeardTopic) -> None:

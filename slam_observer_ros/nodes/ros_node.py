@@ -75,8 +75,7 @@ class ThrottledLog:
 
     def warning(self, subject: str, text: str) -> bool:
         """Log a warning, unless there was one about the subject lately; return whether it is."""
-        is_due = self._is_due(subject)
-        if is_due:
+        if is_due := self._is_due(subject):
             self._node.get_logger().warning(text)
         return is_due
 
