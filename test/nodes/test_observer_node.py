@@ -314,6 +314,13 @@ def test_parameters_describe_themselves(ros, observer):
     assert not gain.read_only
 
 
+def test_a_quality_of_service_that_there_is_none_of_is_refused_with_its_name(ros):
+    name = 'qos_overrides./twist.subscription.reliability'
+    reason = reason_of_refusal(ObserverNode, velocity_type='Twist', **{name: 'relaible'})
+    assert "'qos_overrides./twist.subscription'" in reason
+    assert 'relaible' in reason
+
+
 def test_bad_parameter_at_the_start_is_refused_with_the_reason(ros):
     reason = reason_of_refusal(ObserverNode, publish_rate=0)
     assert 'publish_rate' in reason

@@ -72,6 +72,17 @@ def test_no_two_classes_have_one_name():
     assert [name for name, count in names.items() if count > 1] == []
 
 
+def test_nodes_hand_over_numbers_and_word_no_finding():
+    """What is wrong with a node is judged by ``runs/``, in the words of ``common/findings.py``."""
+    called = [
+        (path.name, node.func.id)
+        for path, node in nodes_of(PACKAGE / 'nodes')
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        if node.func.id in ('found', 'Finding')
+    ]
+    assert called == [('ros_node.py', 'found')], 'but for what is logged as it comes'
+
+
 def test_docstrings_name_their_subjects():
     """Of modules, classes and functions, and of constants, here and in what is not installed."""
     folders = [CHECKOUT / name for name in ('benchmark', 'demo', 'scripts', 'test')]
