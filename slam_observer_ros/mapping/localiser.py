@@ -17,6 +17,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_alignment import (
     AlikeMaps,
+    Differences,
     likeness_by_ids,
     pose_by_tag,
     TagPose,
@@ -81,6 +82,7 @@ class Localiser:
         self._rough: tuple[FloatArray, FloatArray] | None = None
         self._unexplained = Unexplained()
         self._contradiction = Contradiction()
+        self._differences: Differences | None = None
         self._said_problem = False
         self._tag: int | None = None  # which the pose was taken from that is on trial
         self._refused: set[int] = set()  # tags whose poses were wrong
@@ -125,7 +127,7 @@ class Localiser:
         self._trial = self._finder = self._half_finder = self._rough = self._tag = None
         self._said_problem = False
         self._comparisons, self._unexplained = Comparisons(), Unexplained()
-        self._contradiction = Contradiction()
+        self._contradiction, self._differences = Contradiction(), None
 
     @property
     def is_contradicted(self) -> bool:
@@ -162,6 +164,11 @@ class Localiser:
             reason = 'all landmarks are far from where they should be'
         elif self.is_localised and self._unexplained.is_too_much(state, event, missed):
             reason = 'most of what is seen is not in the map'
+        elif self.is_localised and len(self.maps) > 1:
+            if self._differences is None:
+                self._differences = Differences(self.loaded, self.maps)
+            if name := self._differences.note(state, event):
+                reason = f'what is seen is as in the map {name}'
         self.counts['lost'] += reason is not None
         return reason
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
 from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.known_landmarks import anchor, JITTER_M2, KnownLandmarks
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import EstimatedAxes
@@ -206,6 +208,46 @@ class AlikeMaps:
         """Return what is to be said of two of these maps, by number, that are alike; or None."""
         pairs = combinations(sorted(set(maps)), 2)
         return next((self._findings[pair] for pair in pairs if pair in self._findings), None)
+
+
+class Differences:
+    """Whether what is seen is where another map has it that is alike, and not where this one has.
+
+    A pose that was given may be in the wrong one of two halls that are nearly the same.
+    """
+
+    def __init__(self, known: LandmarkMap, maps: Iterable[LandmarkMap]) -> None:
+        # By the other map's name: points that it alone has, and that this one alone has, here.
+        self._points: dict[str, tuple[FloatArray, FloatArray]] = {}
+        for other in maps:
+            alike = None if other is known else likeness_by_ids(other, known)
+            if alike is not None and not alike.is_same.all():
+                theirs = se3.transform(alike.transform, other.world_points[~alike.is_same])
+                is_ours = ~np.isin(known.ids, other.ids[alike.is_same])
+                self._points[other.name] = theirs, known.world_points[is_ours]
+        self._votes = Counter[str]()
+
+    def note(self, state: State, event: ObservationEvent) -> str:
+        """Take an observation in the map; return the other one that it is in by now, or ''."""
+        if not self._points or event.kinds is not None:
+            return ''
+        pose = state.observer.pose
+        seen, noise = se3.transform(pose, event.points), state.observation_noise.covariances(event)
+        near_m = SAME_M + NEAR * np.sqrt(np.trace(noise, axis1=1, axis2=2))
+        for name, each in self._points.items():
+            for_it, against = (
+                (np.linalg.norm(seen[:, None] - points, axis=2) < near_m[:, None]).any(axis=1)
+                for points in each
+            )
+            vote = int((for_it & ~against).any()) - int((against & ~for_it).any())
+            self._votes[name] = max(self._votes[name] + vote, 0)
+            if self._votes[name] >= state.settings.max_rejections:
+                return name
+        return ''
+
+
+NEAR = 3.0
+"""Standard deviations of a point within which it is where a landmark is."""
 
 
 SIGHTINGS = 2

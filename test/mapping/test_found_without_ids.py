@@ -266,6 +266,28 @@ class TestSeveralMaps:
         assert '49 landmarks are the same' in problem.what
         assert estimator.map_name == hall
 
+    @pytest.mark.parametrize('mode', ['fixed', 'uncertain'])
+    @pytest.mark.parametrize('has_ids', [False, True])
+    @pytest.mark.parametrize('given', ['hall_0', 'twin'])
+    def test_a_pose_in_the_wrong_one_of_two_halls_is_put_right_by_what_differs(
+        self, given, has_ids, mode
+    ):
+        worlds, (known, *_) = self.halls()
+        world = worlds[0]
+        other = world.near(8.0, 3)[0]
+        points = known.world_points.copy()
+        points[other] += [3.0, 0.0, 0.0]
+        world.points[other] += [3.0, 0.0, 0.0]
+        estimator = Estimator(world.settings(localization_mode=mode))
+        estimator.load_map([known, replace(known, world_points=points, name='twin')])
+        estimator.set_pose(world.start, 1e-4 * np.eye(6), map_name=given)
+        assert estimator.map_name == given
+        for event in world.drive(0.0, 15.0, count=8):
+            estimator.add(event if has_ids else without_ids(event))
+        assert estimator.map_name == 'twin'
+        assert estimator.counts['lost'] == (given == 'hall_0')
+        assert np.linalg.norm(world.error(estimator, 14.9)) < 0.2
+
     def test_a_pose_that_is_given_says_where_in_each_to_look(self):
         """In halls that are surveyed in one frame it says which one it is."""
         worlds, (known, *_) = self.halls()
