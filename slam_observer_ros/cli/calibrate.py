@@ -446,28 +446,53 @@ def state_found(
     Where several sensors are calibrated, or one that moves, only what is of the velocities.
     """
     is_one = len(found.frames) == 1
-    values: dict[str, Any] = {}
+    values: Values = {}
     comments: dict[str, list[str]] = {}
+    moved: dict[str, float] = {}
     for part in found.parts:
-        name = part.name.partition('/')[0]
+        name, entry = part.name.partition('/')[0], _entry_of(part.name)
         if not is_seen(part) or (name.startswith(('sensor_', 'range_')) and not is_one):
             continue
-        parameter, index = (entry := _entry_of(name)).parameter, entry.axis
-        if parameter not in MOUNT:
-            _put(values, settings, parameter, index, _as_known(part.value, part.deviation))
-        elif sensor_pose is None:
-            continue
-        if '_bias' not in name:  # which is another one on another day
-            deviation = _as_known(part.deviation, part.deviation)
-            _put(values, settings, f'{parameter}_stddev', index, deviation)
+        # With two digits of the standard deviation, six decimals at most
+        digits = 1 - math.floor(math.log10(part.deviation)) if part.deviation > 0.0 else 6
+        stated = {
+            entry.parameter: round(part.value, min(max(digits, 0), 6)),
+            f'{entry.parameter}_stddev': round(part.deviation, min(max(digits, 0), 6)),
+        }
+        if '_bias' in name:  # which is another one on another day
+            del stated[f'{entry.parameter}_stddev']
+        if entry.parameter in MOUNT:
+            if sensor_pose is None:
+                continue
+            moved[name] = part.value
+            del stated[entry.parameter]
+        for parameter, value in stated.items():
+            if entry.axis is None:
+                values[parameter] = value
+            else:
+                entries = list(values.get(parameter, getattr(settings, parameter)))
+                entries[entry.axis] = value
+                values[parameter] = tuple(entries)
         text = f'{part.name}: {part}, looked for within {looked_for(part)}'
-        comments.setdefault(parameter, []).append(text)
-    groups = [('\n'.join(lines), _of(parameter, values)) for parameter, lines in comments.items()]
+        comments.setdefault(entry.parameter, []).append(text)
+    groups = [
+        (
+            '\n'.join(lines),
+            {name: values[name] for name in (of, f'{of}_stddev') if name in values},
+        )
+        for of, lines in comments.items()
+    ]
     if is_one and found.depth_gain is not None:
         values['range_is_depth'] = found.range_is_depth
         groups.append((depth_text(found), {'range_is_depth': found.range_is_depth}))
-    if sensor_pose is not None and any(parameter in comments for parameter in MOUNT):
-        pose = _corrected(sensor_pose, found.parts)
+    if sensor_pose is not None and moved:
+        turn, shift = (
+            np.array([moved.get(f'{name}_{axis}', 0.0) for axis in 'xyz']) for name in MOUNT
+        )
+        angles = Rotation.from_matrix(so3.exp(turn) @ sensor_pose[:3, :3]).as_euler('xyz')
+        numbers = [*(sensor_pose[:3, 3] + shift).tolist(), *angles.tolist()]
+        x, y, z, roll, pitch, yaw = (round(number, 5) for number in numbers)
+        pose: Pose6 = (x, y, z, roll, pitch, yaw)
         inputs = replace(inputs, sensor_pose=pose)
         groups.append(('In place of /tf, which is better put right.', {'sensor_pose': pose}))
     return Stated(replace(settings, **values), inputs, [group for group in groups if group[1]])
@@ -513,41 +538,3 @@ def depth_text(found: Found) -> str:
     gain, deviation = found.depth_gain
     kept = '' if found.range_is_depth == (gain > 0.0) else ', which is not sure, or was not asked'
     return f'{what}: the log likelihood of depth is {gain:+.0f} ± {deviation:.0f} over range{kept}'
-
-
-def _put(
-    values: Values, settings: Settings, parameter: str, index: int | None, value: float
-) -> None:
-    if index is None:
-        values[parameter] = value
-        return
-    entries = list(values.get(parameter, getattr(settings, parameter)))
-    entries[index] = value
-    values[parameter] = tuple(entries)
-
-
-def _of(parameter: str, values: Values) -> Values:
-    names = (parameter, f'{parameter}_stddev')
-    return {name: values[name] for name in names if name in values}
-
-
-def _as_known(value: float, deviation: float) -> float:
-    """Return a value with two digits of its standard deviation, six decimals at most."""
-    decimals = 1 - math.floor(math.log10(deviation)) if deviation > 0.0 else 6
-    return round(value, min(max(decimals, 0), 6))
-
-
-def _corrected(pose: FloatArray, parts: Sequence[CalibrationEstimate]) -> Pose6:
-    """Return x y z and roll pitch yaw of a sensor, moved from its ``pose`` as it was found."""
-    moved = {}
-    for part in parts:
-        name = part.name.partition('/')[0]
-        if is_seen(part):
-            moved[name] = part.value
-    turn, shift = (
-        np.array([moved.get(f'{name}_{axis}', 0.0) for axis in 'xyz']) for name in MOUNT
-    )
-    R = so3.exp(turn) @ pose[:3, :3]
-    values = [*(pose[:3, 3] + shift), *Rotation.from_matrix(R).as_euler('xyz')]
-    x, y, z, roll, pitch, yaw = (round(float(value), 5) for value in values)
-    return x, y, z, roll, pitch, yaw

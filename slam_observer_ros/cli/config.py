@@ -6,7 +6,7 @@ With a JSON schema editors complete and check them.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 import json
 import math
 import sys
@@ -22,7 +22,7 @@ from slam_observer_ros.settings.parameter_file import (
     parameter_file_text,
     read_parameter_file,
 )
-from slam_observer_ros.settings.parameter_table import Parameter, table, Value
+from slam_observer_ros.settings.parameter_table import Parameter, table
 
 DRAFT = 'http://json-schema.org/draft-07/schema#'
 """The draft that editors' YAML plug-ins know."""
@@ -70,16 +70,12 @@ def value_schema(row: Parameter) -> dict[str, object]:
     if isinstance(default, bool):
         schema['type'] = 'boolean'
     elif isinstance(default, str):
-        schema |= {'type': 'string'} if not row.choices else _choices(row)
+        # YAML 1.1, which ROS reads, has a plain off for false.
+        off = [False] if 'off' in row.choices else []
+        schema |= {'enum': [*row.choices, *off]} if row.choices else {'type': 'string'}
     else:
         schema |= {'type': 'integer' if isinstance(default, int) else 'number'} | _bounds(row)
     return schema | {'default': default}
-
-
-def _choices(row: Parameter) -> dict[str, object]:
-    # YAML 1.1, which ROS reads, has a plain off for false.
-    off = [False] if 'off' in row.choices else []
-    return {'enum': [*row.choices, *off]}
 
 
 def _bounds(row: Parameter) -> dict[str, object]:
@@ -121,26 +117,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Print what was asked for."""
-    sys.stdout.write(_text(args))
-
-
-def _text(args: argparse.Namespace) -> str:
+    if args.schema and args.name is not None:
+        raise UsageError('--schema is the same for all parameter files; leave NAME out')
     if args.schema:
-        if args.name is not None:
-            raise UsageError('--schema is the same for all parameter files; leave NAME out')
-        return json.dumps(parameter_schema(ROWS), indent=2, ensure_ascii=False) + '\n'
-    if args.dump:
-        return parameter_file_text(ROWS, _values(args.name))
-    if args.name is None:
-        return ''.join(f'{name}\n' for name in shipped_names())
-    return not_special(find_config(args.name)).read_text(encoding='utf-8')
-
-
-def _values(name: str | None) -> Mapping[str, Value]:
-    """Return the values of a parameter file, checked; none without a name."""
-    if name is None:
-        return {}
-    rows: dict[str, Parameter] = {row.name: row for row in ROWS}
-    written = read_parameter_file(find_config(name))
-    others = names_of_others(written, rows)
-    return {key: rows[key].check(value) for key, value in written.items() if key not in others}
+        text = json.dumps(parameter_schema(ROWS), indent=2, ensure_ascii=False) + '\n'
+    elif args.dump:
+        rows: dict[str, Parameter] = {row.name: row for row in ROWS}
+        written = {} if args.name is None else read_parameter_file(find_config(args.name))
+        others = names_of_others(written, rows)
+        values = {name: rows[name].check(written[name]) for name in written if name not in others}
+        text = parameter_file_text(ROWS, values)
+    elif args.name is None:
+        text = ''.join(f'{name}\n' for name in shipped_names())
+    else:
+        text = not_special(find_config(args.name)).read_text(encoding='utf-8')
+    sys.stdout.write(text)

@@ -59,7 +59,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'starry-night', help='stereo camera and IMU moved by hand: dataset3.mat'
     )
     starry_night.add_argument('file', type=named_path, metavar='FILE', help='dataset3.mat')
-    starry_night.set_defaults(run=_run, load=lambda args: load_starry_night(args.file))
+    starry_night.set_defaults(load=lambda args: load_starry_night(args.file))
     mrclam = data_sets.add_parser(
         'mrclam', help='wheeled robots among coded landmarks: MRCLAM_Dataset1 to 9'
     )
@@ -75,9 +75,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default='point',
         help='leave only directions or distances of the landmarks (default point: both)',
     )
-    mrclam.set_defaults(
-        run=_run, load=lambda args: load_mrclam(args.folder, args.robot, args.measure)
-    )
+    mrclam.set_defaults(load=lambda args: load_mrclam(args.folder, args.robot, args.measure))
     plaza = data_sets.add_parser(
         'plaza',
         help='a mower among radios that give distances: plazaN_dr.csv, _td, _gt and _tl',
@@ -88,7 +86,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     plaza.add_argument('folder', type=named_path, metavar='FOLDER', help='of these files')
     plaza.add_argument('--run', type=int, required=True, metavar='N', dest='number', help='1 or 2')
-    plaza.set_defaults(run=_run_plaza)
+    plaza.set_defaults(load=lambda args: load_plaza(args.folder, args.number))
     graph = data_sets.add_parser(
         'graph', help='poses and points in the plane, in the text formats of iSAM and g2o'
     )
@@ -99,8 +97,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar='FILE',
         help='the same graph with true, or the best, values',
     )
-    graph.set_defaults(run=_run_graph, load=lambda args: load_graph(args.file, args.truth))
-    for data_set in (starry_night, mrclam, plaza, graph):
+    graph.set_defaults(load=lambda args: load_graph(args.file, args.truth))
+    for data_set, write_beside in (
+        (starry_night, None),
+        (mrclam, None),
+        (plaza, _write_survey),
+        (graph, _write_parameters),
+    ):
+        data_set.set_defaults(run=_run, write_beside=write_beside)
         data_set.add_argument(
             'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
         )
@@ -139,20 +143,6 @@ def _run_tum(args: argparse.Namespace) -> None:
     print_table(str(args.output), {'topic': str(topic), 'poses': str(len(trajectory))})
 
 
-def _run_graph(args: argparse.Namespace) -> None:
-    """Write a graph, and beside it the parameters without which its steps mean something else."""
-    parameters: Path = args.output.with_suffix('.yaml')
-    _check(args, parameters)
-    rows = _written(args, args.load(args))
-    try:
-        with unfinished_file(parameters) as file:
-            file.write(GRAPH_PARAMETERS)
-    except OSError as error:
-        raise OutputError(f"can't write {parameters}: {error.strerror}") from error
-    rows['parameters, but for noise'] = f'--config {parameters}'
-    print_table(str(args.output), rows)
-
-
 SURVEY_M = 0.05
 """Standard deviation of coordinates of Plaza's radios, which were surveyed by GPS."""
 
@@ -164,38 +154,15 @@ def surveyed(landmarks: LandmarkTruth) -> LandmarkMap:
     return LandmarkMap(landmarks.ids, landmarks.world_points, covariances, never)
 
 
-def _run_plaza(args: argparse.Namespace) -> None:
-    """Write a run, beside it the survey of its radios, and say where the mower began."""
-    survey: Path = args.output.with_suffix('.yaml')
-    _check(args, survey)
-    data_set = load_plaza(args.folder, args.number)
-    rows = _written(args, data_set)
-    if len(data_set.landmarks.ids) and len(data_set.true_poses):
-        write_map(survey, surveyed(data_set.landmarks), None)
-        start = data_set.true_poses[0]
-        yaw = float(np.arctan2(start[1, 0], start[0, 0]))
-        rows['survey, and where it begins'] = (
-            f'--load-map {survey} --set set_initial_pose=true '
-            f'--set initial_pose=[{start[0, 3]:.3f},{start[1, 3]:.3f},0.0,0.0,0.0,{yaw:.4f}] '
-        )
-    print_table(str(args.output), rows)
-
-
 def _run(args: argparse.Namespace) -> None:
-    _check(args)
-    print_table(str(args.output), _written(args, args.load(args)))
-
-
-def _check(args: argparse.Namespace, beside: Path | None = None) -> None:
+    """Write a recording, and beside it what it takes to be replayed."""
     given = (vars(args).get(name) for name in ('file', 'truth'))  # others have a folder instead
     read = [file for file in given if file is not None]
+    beside = None if args.write_beside is None else args.output.with_suffix('.yaml')
     outputs = {'OUT.mcap': args.output, 'the file beside it': beside}
     check_inputs_are_kept(outputs, {'the data set': read})
     check_outputs(outputs.values(), args.force)
-
-
-def _written(args: argparse.Namespace, data_set: DataSet) -> dict[str, str]:
-    """Write a recording; return what there is to say of it."""
+    data_set: DataSet = args.load(args)
     write_data_set(data_set, args.output, args.force)
     rows = {
         'velocities': str(len(data_set.velocity_stamps_ns)),
@@ -204,4 +171,29 @@ def _written(args: argparse.Namespace, data_set: DataSet) -> dict[str, str]:
         'true landmarks': str(len(data_set.landmarks.ids)),
     }
     rows |= {f'left out: {reason}': str(count) for reason, count in data_set.left_out.items()}
-    return rows
+    if beside is not None:
+        rows |= args.write_beside(beside, data_set)
+    print_table(str(args.output), rows)
+
+
+def _write_parameters(path: Path, _: DataSet) -> dict[str, str]:
+    """Write the parameters without which the steps of a graph mean something else."""
+    try:
+        with unfinished_file(path) as file:
+            file.write(GRAPH_PARAMETERS)
+    except OSError as error:
+        raise OutputError(f"can't write {path}: {error.strerror}") from error
+    return {'parameters, but for noise': f'--config {path}'}
+
+
+def _write_survey(path: Path, data_set: DataSet) -> dict[str, str]:
+    """Write the survey of Plaza's radios, and return where the mower began."""
+    if not (len(data_set.landmarks.ids) and len(data_set.true_poses)):
+        return {}
+    write_map(path, surveyed(data_set.landmarks), None)
+    start = data_set.true_poses[0]
+    yaw = float(np.arctan2(start[1, 0], start[0, 0]))
+    return {
+        'survey, and where it begins': f'--load-map {path} --set set_initial_pose=true '
+        f'--set initial_pose=[{start[0, 3]:.3f},{start[1, 3]:.3f},0.0,0.0,0.0,{yaw:.4f}] '
+    }

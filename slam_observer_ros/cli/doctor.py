@@ -9,7 +9,6 @@ from importlib.util import find_spec
 from itertools import islice
 import json
 import os
-from pathlib import Path
 import platform
 import subprocess
 import sys
@@ -98,13 +97,15 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError('--load-map takes a recording, which is judged by the map')
     if args.recording is not None:
         maps = None if args.load_map is None else read_maps(args.load_map)
-        name, why, events = fitting_file(args.recording)
+        with Recording(args.recording) as recording:
+            selected = recording.find_topics()
+            events = list(islice(recording.events(selected), MOST_EVENTS))
+            rivals = list(of_publishers(recording, selected))
+        name, why = fitting_file(selected.landmarks.message_type, events)
         findings = mistakes(shipped_settings(name), events, maps)
         if maps is not None:
             findings += of_anchors(shipped_settings(name), events, maps)
-        with Recording(args.recording) as recording:
-            selected = recording.find_topics()
-            findings = explained([*findings, *of_publishers(recording, selected)])
+        findings = explained([*findings, *rivals])
         if args.json:
             print_json(
                 {
@@ -137,42 +138,31 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _installed() -> dict[str, str]:
+    ros = 'not found: recordings and simulations only; source a ROS 2 for the nodes'
+    if find_spec('rclpy') is not None:
+        name = os.environ.get('ROS_DISTRO', 'wheels from PyPI')
+        middleware = os.environ.get('RMW_IMPLEMENTATION', 'the default middleware')
+        ros = f'{name}, {middleware}, domain {os.environ.get("ROS_DOMAIN_ID", "0")}'
     found = {
         'slam_observer_ros': __version__,
         'Python': f'{platform.python_version()} ({sys.executable})',
-        'ROS': _ros(),
+        'ROS': ros,
         'step of the filter': core.description(),
     }
-    for package, use in _message_packages().items():
-        found[package] = _presence(find_spec(package) is not None, use)
-    for package, use in OPTIONAL_PACKAGES.items():
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = _presence(False, use)
-    return found
-
-
-def _message_packages() -> dict[str, str]:
-    """Return the packages of messages that may be missing, and what they are for."""
-    packages = {'tf2_msgs': 'poses of sensors on /tf'}
+    packages = {'tf2_msgs': 'poses of sensors on /tf'}  # of messages, that may be missing
     for known in (*message_types('velocity').values(), *message_types('landmarks').values()):
         package = known.name.partition('/')[0]
         if package not in COMMON_PACKAGES:
             packages[package] = known.short_name
-    return packages
-
-
-def _presence(is_there: bool, use: str) -> str:
-    return 'installed' if is_there else f'not installed; it is for {use}'
-
-
-def _ros() -> str:
-    if find_spec('rclpy') is None:
-        return 'not found: recordings and simulations only; source a ROS 2 for the nodes'
-    name = os.environ.get('ROS_DISTRO', 'wheels from PyPI')
-    middleware = os.environ.get('RMW_IMPLEMENTATION', 'the default middleware')
-    return f'{name}, {middleware}, domain {os.environ.get("ROS_DOMAIN_ID", "0")}'
+    for package, use in packages.items():
+        is_there = find_spec(package) is not None
+        found[package] = 'installed' if is_there else f'not installed; it is for {use}'
+    for package, use in OPTIONAL_PACKAGES.items():
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = f'not installed; it is for {use}'
+    return found
 
 
 def _topics(seconds: float) -> list[dict[str, Any]]:
@@ -235,23 +225,15 @@ def of_anchors(
     return of_half_points(estimator.anchor_biases, [])
 
 
-def fitting_file(path: Path) -> tuple[str, str, list[Event]]:
+def fitting_file(kind: str, events: Sequence[Event]) -> tuple[str, str]:
     """Return the name of a shipped parameter file, and in words why it fits a recording.
 
-    And the events of the recording's beginning.
+    ``kind`` is the type of its landmarks; ``events`` are its beginning.
     """
-    with Recording(path) as recording:
-        selected = recording.find_topics()
-        kind = selected.landmarks.message_type
-        events = list(islice(recording.events(selected), MOST_EVENTS))
-        velocities = np.array(
-            [event.body_velocity for event in events if isinstance(event, VelocityEvent)]
-        ).reshape(-1, 6)
+    velocities = np.array(
+        [event.body_velocity for event in events if isinstance(event, VelocityEvent)]
+    ).reshape(-1, 6)
     seen = [e for e in events if isinstance(e, ObservationEvent) and len(e.ids)]
-    return *_fitting(kind, velocities, seen), events
-
-
-def _fitting(kind: str, velocities: FloatArray, seen: list[ObservationEvent]) -> tuple[str, str]:
     flat = _is_flat(velocities)
     where = 'the robot stays on a floor' if flat else 'it tilts or climbs: two_d_mode: false'
     kinds = {half for e in seen for half in (e.kinds.tolist() if e.kinds is not None else [POINT])}

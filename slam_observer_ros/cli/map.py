@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from contextlib import suppress
 import math
 
 import numpy as np
@@ -16,16 +18,31 @@ from slam_observer_ros.cli.options import (
     named_path,
 )
 from slam_observer_ros.lie.axes import axes_of
-from slam_observer_ros.mapping.map_alignment import Likeness
-from slam_observer_ros.mapping.map_check import (
-    look_around,
-    Looks,
-    place_for_another,
-    symmetries,
-)
+from slam_observer_ros.mapping.map_check import look_around, place_for_another, symmetries
 from slam_observer_ros.mapping.map_file import read_map, write_map
 from slam_observer_ros.mapping.map_import import import_map, LENGTHS, TAG_AXES
 from slam_observer_ros.settings.estimator_settings import ERROR_PROBABILITY, Settings
+
+
+def _number(
+    what: str, unit: str = '', most: float = math.inf, may_be_zero: bool = False
+) -> Callable[[str], float]:
+    """Return an argparse type that takes finite numbers above zero, with or without a unit."""
+
+    def parse(text: str) -> float:
+        with suppress(ValueError):
+            value = float(text.removesuffix(unit))
+            is_right = value > 0.0 or (may_be_zero and value == 0.0)
+            if is_right and value <= most and math.isfinite(value):
+                return value
+        raise argparse.ArgumentTypeError(f'{text} is no {what}')
+
+    return parse
+
+
+_deviation = _number('standard deviation', may_be_zero=True)
+_metres = _number('length in metres', 'm')
+_degrees = _number('angle of up to 360 degrees', '°', 360.0)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -78,24 +95,40 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_force_option(convert)
     convert.set_defaults(run=_convert)
-    _add_check_options(
-        actions.add_parser(
-            'check',
-            help='where one look finds a robot by landmarks without ids',
-            description='Looks around from places all over a map, and says where the landmarks in '
-            'view, without ids, say where the robot is.',
-        )
+    check = actions.add_parser(
+        'check',
+        help='where one look finds a robot by landmarks without ids',
+        description='Looks around from places all over a map, and says where the landmarks in '
+        'view, without ids, say where the robot is.',
     )
-
-
-def _deviation(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text} is no standard deviation')
-    return value
+    check.add_argument('file', type=named_path, metavar='MAP.yaml', help='map file')
+    check.add_argument(
+        '--view',
+        type=_metres,
+        default=15.0,
+        metavar='M',
+        help='how far the sensor sees, metres (default 15)',
+    )
+    check.add_argument(
+        '--fov',
+        type=_degrees,
+        default=360.0,
+        metavar='DEG',
+        help='its field of view, degrees (default 360)',
+    )
+    check.add_argument(
+        '--sigma',
+        type=_metres,
+        default=0.02,
+        metavar='M',
+        help='standard deviation of each coordinate that it measures, metres (default 0.02)',
+    )
+    check.add_argument(
+        '--space', action='store_true', help='a robot that also rolls and pitches, not two_d_mode'
+    )
+    check.add_argument('--plot', type=named_path, metavar='OUT.png', help='picture of it to write')
+    add_force_option(check)
+    check.set_defaults(run=_check)
 
 
 def _convert(args: argparse.Namespace) -> None:
@@ -115,39 +148,6 @@ def _convert(args: argparse.Namespace) -> None:
     print_table(str(args.output), found)
 
 
-def _add_check_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('file', type=named_path, metavar='MAP.yaml', help='map file')
-    parser.add_argument(
-        '--view',
-        type=_metres,
-        default=15.0,
-        metavar='M',
-        help='how far the sensor sees, metres (default 15)',
-    )
-    parser.add_argument(
-        '--fov',
-        type=_degrees,
-        default=360.0,
-        metavar='DEG',
-        help='its field of view, degrees (default 360)',
-    )
-    parser.add_argument(
-        '--sigma',
-        type=_metres,
-        default=0.02,
-        metavar='M',
-        help='standard deviation of each coordinate that it measures, metres (default 0.02)',
-    )
-    parser.add_argument(
-        '--space', action='store_true', help='a robot that also rolls and pitches, not two_d_mode'
-    )
-    parser.add_argument(
-        '--plot', type=named_path, metavar='OUT.png', help='picture of it to write'
-    )
-    add_force_option(parser)
-    parser.set_defaults(run=_check)
-
-
 def _check(args: argparse.Namespace) -> None:
     check_inputs_are_kept({'--plot': args.plot}, {'the map': [args.file]})
     check_outputs([args.plot], args.force)
@@ -162,10 +162,28 @@ def _check(args: argparse.Namespace) -> None:
         settings.map_noise,
         ERROR_PROBABILITY,
     )
+    found, seen, least = looks.is_found, looks.seen, 4 if args.space else 3
+    ambiguous = ~found & (seen >= least)
+    by_one = f'{found.mean():.0%}'
+    if found.any():
+        by_one += (
+            f', by {seen[found].min()} landmarks or more, wrong with a probability of '
+            f'{looks.error_probabilities[found].max():.0e} at most'
+        )
+    values = {
+        'landmarks': str(len(known.ids)),
+        'looks': f'{len(seen)}, with {np.median(seen):.0f} landmarks in view (median)',
+        'found by one look': by_one,
+        'fits elsewhere, too': f'{ambiguous.mean():.0%}',
+        'too few in view': f'{(seen < least).mean():.0%} (fewer than {least})',
+        'looks the same': 'not when turned',
+    }
     same = symmetries(known)
     another = place_for_another(known, same[0]) if same else None
-    values = {'landmarks': str(len(known.ids))} | _values(looks, args.space)
-    values['looks the same'] = _symmetry(same)
+    if same:
+        differ = int(np.count_nonzero(~same[0].is_same))
+        but = f' but for {differ} of its landmarks' if differ else ''
+        values['looks the same'] = f'when turned by {same[0].turn_deg:.0f}°{but}'
     if another is not None:
         values['one more landmark'] = f'at ({another[0]:.1f} m, {another[1]:.1f} m) would do'
     print_table(str(args.file), values)
@@ -173,51 +191,5 @@ def _check(args: argparse.Namespace) -> None:
         # matplotlib takes half a second to import.
         from slam_observer_ros.runs.figures import plot_map_check
 
-        too_few = looks.fitting == 0
-        places = looks.poses[:, :3, 3]
-        plot_map_check(args.plot, known.world_points, places, looks.is_found, too_few, another)
-
-
-def _values(looks: Looks, in_space: bool) -> dict[str, str]:
-    """Return what looks from all over the map say."""
-    found, least = looks.is_found, 4 if in_space else 3
-    seen, too_few = looks.seen, looks.seen < least
-    ambiguous = ~found & ~too_few
-    values = {'looks': f'{len(seen)}, with {np.median(seen):.0f} landmarks in view (median)'}
-    values['found by one look'] = f'{found.mean():.0%}'
-    if found.any():
-        values['found by one look'] += (
-            f', by {seen[found].min()} landmarks or more, wrong with a probability of '
-            f'{looks.error_probabilities[found].max():.0e} at most'
-        )
-    values['fits elsewhere, too'] = f'{ambiguous.mean():.0%}'
-    values['too few in view'] = f'{too_few.mean():.0%} (fewer than {least})'
-    return values
-
-
-def _symmetry(same: list[Likeness]) -> str:
-    """Return how the map may be turned and look the same."""
-    if not same:
-        return 'not when turned'
-    best = same[0]
-    differ = int(np.count_nonzero(~best.is_same))
-    but = f' but for {differ} of its landmarks' if differ else ''
-    return f'when turned by {best.turn_deg:.0f}°{but}'
-
-
-def _metres(text: str) -> float:
-    return _positive(text.removesuffix('m'), math.inf, f'{text} is no length in metres')
-
-
-def _degrees(text: str) -> float:
-    return _positive(text.removesuffix('°'), 360.0, f'{text} is no angle of up to 360 degrees')
-
-
-def _positive(text: str, most: float, problem: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not (0.0 < value <= most and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(problem)
-    return value
+        too_few, places = looks.fitting == 0, looks.poses[:, :3, 3]
+        plot_map_check(args.plot, known.world_points, places, found, too_few, another)

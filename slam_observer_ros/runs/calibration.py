@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -251,8 +251,7 @@ _PER_MEDIAN = 1.4826
 """Standard deviation over the median of the absolute value, of normal distributions."""
 
 
-@dataclass(frozen=True, slots=True)
-class Driven:
+class Driven(NamedTuple):
     """Per axis (6,), angular first: root mean square of the velocity, and its ``noise_share``.
 
     That is the variance of the mean between two observations over the variance which it
@@ -304,30 +303,26 @@ def opened(
         'velocity_delay_stddev': DELAY_S,
     }
     wide: dict[str, Any] = {
-        name: _at_least(getattr(settings, name), value) for name, value in least.items()
+        name: np.maximum(getattr(settings, name), value) for name, value in least.items()
     }
     if not is_surveyed and 'linear_scale_stddev' not in kept:
         wide['range_scale_stddev'] = 0.0
-    wide |= {
-        'angular_scale_stddev': tuple(scales[:3].tolist()),
-        'linear_scale_stddev': tuple(scales[3:].tolist()),
+    wide |= {'angular_scale_stddev': scales[:3], 'linear_scale_stddev': scales[3:]}
+    wide = {name: value for name, value in wide.items() if name not in kept}
+    wide |= {'angular_velocity_noise': noise[0], 'linear_velocity_noise': noise[1]}
+    values: dict[str, Any] = {
+        name: tuple(value.tolist()) if np.ndim(value) else float(value)
+        for name, value in wide.items()
     }
     return replace(
         settings,
-        **{name: value for name, value in wide.items() if name not in kept},
-        angular_velocity_noise=tuple(noise[0].tolist()),
-        linear_velocity_noise=tuple(noise[1].tolist()),
+        **values,
         angular_scale_noise=(0.0, 0.0, 0.0),
         linear_scale_noise=(0.0, 0.0, 0.0),
         calibration_drift=0.0,
         smoothing_window=0,
         localization_mode='uncertain' if is_surveyed else 'off',
     )
-
-
-def _at_least(stated: Value, least: Value) -> Value:
-    entries = np.maximum(stated, least).tolist()
-    return tuple(entries) if isinstance(entries, list) else float(entries)
 
 
 def _of_axes(stamps_ns: IntArray, V: FloatArray, every_ns: float) -> tuple[FloatArray, FloatArray]:

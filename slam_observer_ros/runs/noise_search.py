@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -65,12 +65,13 @@ def of_points(settings: Settings) -> list[NoiseKind]:
 
 
 def _stated(possible: Sequence[NoiseKind], settings: Settings) -> list[NoiseKind]:
-    kinds = []
-    for kind in possible:
-        stated = tuple(name for name in kind.parameters if np.any(getattr(settings, name)))
-        if stated:
-            kinds.append(NoiseKind(kind.name, stated))
-    return kinds
+    kinds = [
+        NoiseKind(
+            kind.name, tuple(name for name in kind.parameters if np.any(getattr(settings, name)))
+        )
+        for kind in possible
+    ]
+    return [kind for kind in kinds if kind.parameters]
 
 
 def scaled(
@@ -83,15 +84,10 @@ def scaled(
     values: dict[str, Any] = {}
     for kind, log_factor in zip(kinds, log_factors, strict=True):
         for name in kind.parameters:
-            values[name] = _scaled(name, getattr(settings, name), math.exp(log_factor))
+            row, factor = _ROWS[name], math.exp(log_factor)
+            within = np.clip(factor * np.array(getattr(settings, name)), row.minimum, row.maximum)
+            values[name] = tuple(within.tolist()) if within.ndim else float(within)
     return replace(settings, **values)
-
-
-def _scaled(name: str, value: Value, factor: float) -> Value:
-    row = _ROWS[name]
-    entries = value if isinstance(value, tuple) else (float(value),)
-    within = tuple(min(max(factor * entry, row.minimum), row.maximum) for entry in entries)
-    return within if isinstance(value, tuple) else within[0]
 
 
 LARGEST = math.log(32.0)
@@ -116,16 +112,15 @@ DIGITS = 3
 Objective = Callable[[FloatArray], float]
 
 
-@dataclass(frozen=True, slots=True)
-class LikelyFactors:
-    """Logarithms (n,) of the most likely factors.
+class LikelyFactors(NamedTuple):
+    """Logarithms of the most likely factors, and their deviations.
 
-    ``deviations`` (n,) are by the curvature of the log likelihood, where all others are unknown,
-    too; infinite where it has no maximum there.
+    These are by the curvature of the log likelihood, where all others are unknown, too; infinite
+    where it has no maximum there.
     """
 
-    logs: FloatArray
-    deviations: FloatArray
+    logs: FloatArray  # (n,)
+    deviations: FloatArray  # (n,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,26 +164,16 @@ def most_likely(objective: Objective, n: int) -> LikelyFactors:
             'fatol': 0.5 * TOLERANCE,
         },
     )
-    best = np.asarray(result.x, dtype=np.float64)
-    return LikelyFactors(best, _deviations(objective, best))
-
-
-def _deviations(objective: Objective, x: FloatArray) -> FloatArray:
-    """Return the standard deviations (n,) that the curvature at a maximum says."""
-    n, h = len(x), CURVATURE_STEP
-    steps = h * np.eye(n)
-    middle = objective(x)
+    x, h = np.asarray(result.x, dtype=np.float64), CURVATURE_STEP
+    steps, middle = h * np.eye(n), objective(x)
     sides = np.array([[objective(x + step), objective(x - step)] for step in steps])
     H = np.diag(2.0 * middle - sides.sum(axis=1)) / h**2  # of minus the log likelihood
     for i in range(n):
         for j in range(i):
             both = objective(x + steps[i] + steps[j])
             H[i, j] = H[j, i] = (sides[i, 0] + sides[j, 0] - middle - both) / h**2
-    return _inverted(H)
-
-
-def _inverted(H: FloatArray) -> FloatArray:
-    deviations = np.full(len(H), math.inf)
+    # Where it has no maximum nothing is known.
+    deviations = np.full(n, math.inf)
     curved = np.flatnonzero(np.diagonal(H) > 0.0)
     while len(curved):
         part = H[np.ix_(curved, curved)]
@@ -197,7 +182,7 @@ def _inverted(H: FloatArray) -> FloatArray:
             deviations[curved] = np.sqrt(np.diagonal(np.linalg.inv(part)))
             break
         curved = np.delete(curved, np.argmax(np.abs(vectors[:, 0])))
-    return deviations
+    return LikelyFactors(x, deviations)
 
 
 def remembered(objective: Callable[[Sequence[float]], float]) -> Objective:
@@ -243,10 +228,5 @@ def search_noise(
 
 def rounded(value: Value) -> Value:
     """Return a figure, or a vector of them, as it is written."""
-    if isinstance(value, tuple):
-        return tuple(_rounded(entry) for entry in value)
-    return _rounded(float(value))
-
-
-def _rounded(value: float) -> float:
-    return float(f'{value:.{DIGITS}g}')
+    entries = [float(f'{entry:.{DIGITS}g}') for entry in np.ravel(value).tolist()]
+    return tuple(entries) if isinstance(value, tuple) else entries[0]

@@ -7,7 +7,8 @@ observations alike, so that stretches in which nothing is seen count too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 import logging
 import time
@@ -271,8 +272,17 @@ class _RunningReplay:
             recorder.note_update(update)
         known, world_points = self._estimator.landmark_ids, self._estimator.world_points
         self._ranges.note_update(update, known, world_points)
-        self._count_observation()
-        self._compare_with_truth(update, known, world_points)
+        used = used_points(self._estimator.counts)
+        self._observations += used > self._used_points
+        self._used_points = used
+        if self._pose_truth is None or self._landmark_tracks is None:
+            return
+        # What is compared with the truth is kept; it is compared now if a covariance may be due.
+        self._uncompared.append((update, known, world_points))
+        has_errors = len(known) > 0 and not self._in_fixed_map
+        is_nees_due = has_errors and update.stamp_ns >= self._next_nees_ns
+        if is_nees_due or len(self._uncompared) == MOST_UNCOMPARED:
+            self._compare(self._pose_truth, self._landmark_tracks, is_nees_due)
 
     def _on_jump(self) -> None:
         self._next_nees_ns = 0
@@ -280,21 +290,6 @@ class _RunningReplay:
             self._clear_figures()
             for recorder in self._recorders:
                 recorder.clear()
-
-    def _count_observation(self) -> None:
-        used = used_points(self._estimator.counts)
-        self._observations += used > self._used_points
-        self._used_points = used
-
-    def _compare_with_truth(self, update: Update, ids: IntArray, points: FloatArray) -> None:
-        """Keep what is compared with the truth; compare it now if a covariance may be due."""
-        if self._pose_truth is None or self._landmark_tracks is None:
-            return
-        self._uncompared.append((update, ids, points))
-        has_errors = len(ids) > 0 and not self._in_fixed_map
-        is_nees_due = has_errors and update.stamp_ns >= self._next_nees_ns
-        if is_nees_due or len(self._uncompared) == MOST_UNCOMPARED:
-            self._compare(self._pose_truth, self._landmark_tracks, is_nees_due)
 
     def _compare(self, poses: Trajectory, tracks: LandmarkTracks, is_nees_due: bool) -> None:
         """Compare what is kept with the truth; a covariance is known of the last of it."""
@@ -345,14 +340,16 @@ class Accuracy:
 def measure(run: Replay, truth: Truth) -> Accuracy:
     """Compare what came of a replay with the truth."""
     pose_truth, estimator = Trajectory(truth.stamps_ns, truth.poses), run.estimator
-    return Accuracy(
+    errors = (
         _pose_errors('trajectory', run.trajectory, pose_truth),
         _pose_errors('dead reckoning', run.dead_reckoning, pose_truth),
         _landmark_rmse_m(estimator.landmark_ids, estimator.world_points, truth),
-        run.configuration.rmse_m,
-        None if run.in_known_map else _anees(run.trajectory, run.pose_covariances, pose_truth),
-        run.configuration.anees,
     )
+    anees = None
+    if not run.in_known_map and (covariances := run.pose_covariances) is not None:
+        with _unknown_if_unfit('unknown_anees'):
+            anees = anchored_average_nees(run.trajectory, covariances, pose_truth)
+    return Accuracy(*errors, run.configuration.rmse_m, anees, run.configuration.anees)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -430,33 +427,23 @@ def _calibrated(motion: Trajectory, estimator: Estimate) -> Trajectory:
 
 
 def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
-    if not len(truth):
-        return None
-    try:
-        return trajectory_errors(estimate, truth)
-    except EvaluationError as error:
-        logger.warning('%s', found('uncompared', figure=name, error=error))
-        return None
-
-
-def _anees(
-    trajectory: Trajectory, pose_covariances: FloatArray | None, truth: Trajectory
-) -> float | None:
-    if pose_covariances is None:
-        return None
-    try:
-        return anchored_average_nees(trajectory, pose_covariances, truth)
-    except EvaluationError as error:
-        logger.warning('%s', found('unknown_anees', error=error))
-        return None
+    with _unknown_if_unfit('uncompared', figure=name):
+        return trajectory_errors(estimate, truth) if len(truth) else None
+    return None
 
 
 def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
     if truth.landmarks is None or (len(ids) and is_automatic(ids).all()):
         return None  # landmarks without ids of their own have no counterpart
+    with _unknown_if_unfit('uncompared', figure='map'):
+        return landmark_errors(ids, world_points, truth.landmarks).rmse_m
+    return None
+
+
+@contextmanager
+def _unknown_if_unfit(kind: str, **figures: str) -> Iterator[None]:
+    """Log, as a finding of a kind, what can't be compared."""
     try:
-        errors = landmark_errors(ids, world_points, truth.landmarks)
+        yield
     except EvaluationError as error:
-        logger.warning('%s', found('uncompared', figure='map', error=error))
-        return None
-    return errors.rmse_m
+        logger.warning('%s', found(kind, error=error, **figures))

@@ -16,9 +16,9 @@ import numpy as np
 
 from slam_observer_ros.common.errors import significant
 from slam_observer_ros.common.findings import explained, Finding, found, Level, SUSPICIOUS
-from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.estimates import Innovations, Reason
+from slam_observer_ros.estimates import DELAY_NAME, Innovations, Reason
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.recordings.decoding import input_decoders
@@ -309,13 +309,12 @@ def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int,
             break
         if all(end <= other_start or start >= other_end for other_start, other_end in found):
             found.append((start, end))
-    return [_trimmed(errors_m, start, end) for start, end in found]
-
-
-def _trimmed(errors_m: FloatArray, start: int, end: int) -> tuple[int, int]:
-    """Return the rows of the largest error in a window, and of the least one before it."""
-    largest = start + int(np.argmax(errors_m[start : end + 1]))
-    return start + int(np.argmin(errors_m[start : largest + 1])), largest
+    # In each from the least error on to the largest one
+    tops = [start + int(np.argmax(errors_m[start : end + 1])) for start, end in found]
+    return [
+        (start + int(np.argmin(errors_m[start : top + 1])), top)
+        for (start, _), top in zip(found, tops, strict=True)
+    ]
 
 
 def _of_growth(result: Result) -> list[Finding]:
@@ -374,12 +373,37 @@ def _blind(result: Result, start_s: float, end_s: float) -> str:
 
 
 def _of_axes(result: Result) -> Iterator[Finding]:
-    """Judge the noise of each axis of the motion by the true motion."""
-    ratios = motion_ratios(result)
-    if ratios is None:
+    """Judge the noise of each axis of the motion by the true motion.
+
+    Motions are compared over windows, less what a constant scale and a bias explain.
+    """
+    reckoned, delay_ns = result.run.dead_reckoning, 0
+    for part in result.calibration:
+        if part.name == DELAY_NAME:
+            delay_ns = to_ns(part.value)
+    first_ns, last_ns = reckoned.stamps_ns[[0, -1]].tolist()
+    edges_ns = np.arange(first_ns, last_ns, WINDOW_NS, dtype=np.int64)
+    true, is_true = interpolate(Trajectory(result.truth.stamps_ns, result.truth.poses), edges_ns)
+    measured, is_measured = interpolate(reckoned, edges_ns - delay_ns)
+    both = is_true & is_measured
+    usable = both[1:] & both[:-1]
+    if np.count_nonzero(usable) < MIN_WINDOWS:
         return
-    for axis in (2, 3, 4) if result.settings.two_d_mode else range(6):
-        ratio = float(ratios[axis])
+    true, measured = ((se3.inverse(poses[:-1]) @ poses[1:])[usable] for poses in (true, measured))
+    window_s, motions = to_s(WINDOW_NS), se3.log(true)
+    errors = se3.log(se3.inverse(true) @ measured)
+    s = result.settings
+    density = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
+    scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
+    stated = density**2 * window_s + (scale * motions) ** 2 / window_s
+    # A turn within a window moves its end sideways: half-way on average.
+    way_squared = np.sum(motions[:, 3:] ** 2, axis=1, keepdims=True)
+    stated[:, 3:] += way_squared / 3.0 * stated[:, :3].sum(axis=1, keepdims=True)
+    for axis in (2, 3, 4) if s.two_d_mode else range(6):
+        design = np.column_stack([motions[:, axis], np.ones(len(motions))])
+        fit, *_ = np.linalg.lstsq(design, errors[:, axis], rcond=None)
+        left, mean = errors[:, axis] - design @ fit, stated[:, axis].mean()
+        ratio = math.sqrt(np.mean(left**2) / mean) if mean > 0.0 else 0.0
         if ratio > TOO_LITTLE:
             kind, motion = ('angular', 'turns') if axis < 3 else ('linear', 'ways')
             yield found(
@@ -389,54 +413,6 @@ def _of_axes(result: Result) -> Iterator[Finding]:
                 ratio=significant(ratio, 2),
                 motion=motion,
             )
-
-
-def motion_ratios(result: Result) -> FloatArray | None:
-    """Return how large the errors of the motion are for what is stated: (6,), angular first.
-
-    Of each axis, over windows of 5 s, less a constant scale and bias. None if there are too few.
-    """
-    true, measured = _motions(result)
-    if len(true) < MIN_WINDOWS:
-        return None
-    window_s = to_s(WINDOW_NS)
-    errors = se3.log(se3.inverse(true) @ measured)
-    motions = se3.log(true)
-    left = np.array([_without_calibration(motions[:, axis], errors[:, axis]) for axis in range(6)])
-    s = result.settings
-    density = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
-    scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
-    stated = density**2 * window_s + (scale * motions) ** 2 / window_s
-    # A turn within a window moves its end sideways: half-way on average.
-    way_squared = np.sum(motions[:, 3:] ** 2, axis=1, keepdims=True)
-    stated[:, 3:] += way_squared / 3.0 * stated[:, :3].sum(axis=1, keepdims=True)
-    means = stated.mean(axis=0)
-    return np.asarray(np.sqrt(np.mean(left.T**2, axis=0) / np.where(means > 0.0, means, np.inf)))
-
-
-def _motions(result: Result) -> tuple[FloatArray, FloatArray]:
-    """Return true and measured motions (w, 4, 4) of windows that both cover."""
-    truth = Trajectory(result.truth.stamps_ns, result.truth.poses)
-    delay_s = next((p.value for p in result.calibration if p.name == 'velocity_delay'), 0.0)
-    first, last = result.run.dead_reckoning.stamps_ns[[0, -1]].tolist()
-    edges_ns = np.arange(first, last, WINDOW_NS, dtype=np.int64)
-    true, is_true = interpolate(truth, edges_ns)
-    delay_ns = round(delay_s * NANOSECONDS_PER_SECOND)
-    measured, is_measured = interpolate(result.run.dead_reckoning, edges_ns - delay_ns)
-    both = is_true & is_measured
-    usable = both[1:] & both[:-1]
-    return (
-        (se3.inverse(true[:-1]) @ true[1:])[usable],
-        (se3.inverse(measured[:-1]) @ measured[1:])[usable],
-    )
-
-
-def _without_calibration(motions: FloatArray, errors: FloatArray) -> FloatArray:
-    """Return errors (w,) less what a constant scale and a bias explain of them."""
-    design = np.column_stack([motions, np.ones(len(motions))])
-    fit, *_ = np.linalg.lstsq(design, errors, rcond=None)
-    left: FloatArray = errors - design @ fit
-    return left
 
 
 def _of_gaps(innovations: Innovations) -> Iterator[Finding]:
