@@ -202,7 +202,8 @@ class ObserverCore:
         self._node = node
         self._entities = Entities(node)
         self._log = ThrottledLog(node)
-        settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
+        settings = read_settings(node, ObserverNodeSettings).with_plain_frames()
+        settings.check_frames()
         estimator_settings = read_settings(node, Settings)
         noise = NoiseFit()
         self._flow = flow = DataFlow(node, settings, estimator_settings, noise.add)

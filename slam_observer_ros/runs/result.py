@@ -98,7 +98,7 @@ class Request:
         inputs, default = self.inputs, InputSettings().base_frame
         if not inputs.base_frame:
             inputs = replace(inputs, base_frame=self._base_frame(recording, selected, default))
-        replace(inputs, base_frame=inputs.base_frame or default).check_frames_differ()
+        replace(inputs, base_frame=inputs.base_frame or default).check_frames()
         truth = recording.truth(selected, inputs.base_frame)
         return selected, inputs, truth.flattened() if self.settings.two_d_mode else truth
 

@@ -155,24 +155,18 @@ class InputSettings:
     def with_plain_frames(self: InputSettingsT) -> InputSettingsT:
         """Return the settings with frames as tf2 has them, without a leading slash.
 
-        Raises
-        ------
-        ParameterError
-            If the map's frame has no name.
-
+        If the map's frame has no name, a ParameterError says so.
         """
         names = ('map_frame', 'odom_frame', 'base_frame', 'sensor_frame')
         plain = replace(self, **{name: getattr(self, name).lstrip('/') for name in names})
-        plain.check_named('map_frame')
+        if not plain.map_frame:
+            raise ParameterError("'map_frame' is empty: give it the name of a frame")
         return plain
 
-    def check_named(self, parameter_name: str) -> None:
-        """Raise a ParameterError, which says what to do, if the name of a frame is empty."""
-        if not getattr(self, parameter_name):
-            raise ParameterError(f"'{parameter_name}' is empty: give it the name of a frame")
-
-    def check_frames_differ(self) -> None:
-        """Raise a ParameterError if two of map, odometry and base have the same name."""
+    def check_frames(self) -> None:
+        """Raise a ParameterError, which says what to do, if frames are the same, or base is ''."""
+        if not self.base_frame:
+            raise ParameterError("'base_frame' is empty: give it the name of a frame")
         for one, other in combinations(('map_frame', 'odom_frame', 'base_frame'), 2):
             frame = getattr(self, one)
             if not frame or frame != getattr(self, other):
@@ -265,21 +259,6 @@ class ObserverNodeSettings(InputSettings):
         maximum=1e9,
     )
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
-
-    def with_checked_frames(self) -> ObserverNodeSettings:
-        """Return the settings with plain frames that differ.
-
-        Raises
-        ------
-        ParameterError
-            If map or base has no name, or two of map, odometry and base have the same; it says
-            what to do.
-
-        """
-        plain = self.with_plain_frames()
-        plain.check_named('base_frame')
-        plain.check_frames_differ()
-        return plain
 
 
 @dataclass(frozen=True)

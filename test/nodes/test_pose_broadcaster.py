@@ -231,7 +231,8 @@ def test_where_the_map_is_published_below_the_base_that_may_have_another_parent(
 
 def test_frames_have_no_leading_slash():
     settings = ObserverNodeSettings(base_frame='/base', sensor_frame='//eye', odom_frame='/')
-    plain = settings.with_checked_frames()
+    plain = settings.with_plain_frames()
+    plain.check_frames()
     assert (plain.base_frame, plain.sensor_frame, plain.odom_frame) == ('base', 'eye', '')
 
 
