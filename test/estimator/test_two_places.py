@@ -83,8 +83,7 @@ def with_twin(first, second):
     return ids
 
 
-@pytest.mark.parametrize('mode', MODES)
-@pytest.mark.parametrize('most', [1, 12])
+@pytest.mark.parametrize(('mode', 'most'), [(MODES[0], 1), (MODES[1], 12), (MODES[2], 1)])
 def test_an_id_that_is_there_twice_is_named_once_and_what_to_do(mode, most, caplog):
     drive = Drive(mode, with_twin(4, 9)).go(1.0, most=most)
     drive.go(1.0, outliers=0.1, most=most)
@@ -103,8 +102,7 @@ def test_two_tags_of_one_id_that_two_cameras_see_at_once_are_named(mode):
     assert drive.named == ['4']
 
 
-@pytest.mark.parametrize('mode', ['mapping', 'fixed'])
-@pytest.mark.parametrize('most', [1, 12])
+@pytest.mark.parametrize(('mode', 'most'), [('mapping', 12), ('fixed', 1)])
 def test_a_landmark_that_moves_once_and_points_that_are_wrong_are_not_named(mode, most):
     drive = Drive(mode).go(1.3, outliers=0.1, most=most)
     drive.tags[[2, 7]] += [[1.5, -1.0, 0.0], [-2.0, 0.5, 0.0]]
@@ -112,8 +110,7 @@ def test_a_landmark_that_moves_once_and_points_that_are_wrong_are_not_named(mode
     assert not drive.named
 
 
-@pytest.mark.parametrize('mode', ['mapping', 'fixed'])
-@pytest.mark.parametrize('most', [1, 12])
+@pytest.mark.parametrize(('mode', 'most'), [('mapping', 12), ('fixed', 1)])
 def test_a_robot_that_is_carried_there_and_back_again_is_not_taken_for_it(mode, most):
     drive = Drive(mode).go(1.0, most=most)
     for carried_s in (4.0, -4.0, 6.0):

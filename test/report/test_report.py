@@ -21,6 +21,7 @@ from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.run_health import growth_windows
 
 MEGABYTE = 1_000_000
+FIGURES = 'curves', 'map', 'side'
 
 
 @pytest.fixture(name='reported', scope='module')
@@ -172,9 +173,17 @@ def opened_with(report: Path, script: str) -> Opened:
     return opened
 
 
-def test_motion_in_space_has_a_view_that_turns(report):
-    assert not numbers_of(report)['is_flat']
-    script = """
+@pytest.fixture(name='answers', scope='module')
+def fixture_answers(reported):
+    """What scripts, one after another in one page, say of a report."""
+    blocks = [f'answers.{name} = (() => {{{code}}})();' for name, code in SCRIPTS.items()]
+    title = 'document.title = JSON.stringify(answers);'
+    script = 'const answers = {};' + ''.join(blocks) + title
+    return json.loads(run_in_page(reported / 'run.html', script))
+
+
+SCRIPTS = {
+    'turned': """
         const side = document.getElementById('side'), turn = document.getElementById('turn');
         const seen = () => side.data.find((trace) => trace.name === 'estimate').x.slice();
         const before = seen();
@@ -183,58 +192,81 @@ def test_motion_in_space_has_a_view_that_turns(report):
         const after = seen(), xyz = run.path.xyz;
         const equal = (a, b) => a.every((v, n) => Math.abs(v - b[n]) < 1e-9);
         const hidden = document.getElementById('views').hidden;
-        document.title = [equal(before, xyz[0]), equal(after, xyz[1]), hidden].join();
-    """
-    assert run_in_page(report, script) == 'true,true,false'
-
-
-def test_ellipses_hold_95_percent_in_any_view(report):
-    script = """
+        return [equal(before, xyz[0]), equal(after, xyz[1]), hidden];
+    """,
+    'ellipses': """
         const xs = [], ys = [];
         addEllipse(1, 2, [4, 0.5, 0.2, 1, 0.1, 9], PLAN, xs, ys);
         const distances = xs.slice(0, -1).map((x, n) => {
           const u = x - 1, v = ys[n] - 2;
           return (u * u - u * v + 4 * v * v) / (4 - 0.25);
         });
-        document.title = distances.every((d) => Math.abs(d - 5.991464547) < 1e-6);
-    """
-    assert run_in_page(report, script) == 'true'
-
-
-def test_on_paper_each_curve_is_a_figure_of_its_own(report):
-    script = """
+        return distances.every((d) => Math.abs(d - 5.991464547) < 1e-6);
+    """,
+    'paper': """
         dispatchEvent(new Event('beforeprint'));
         const onPaper = document.querySelectorAll('#curves > div.js-plotly-plot').length;
         dispatchEvent(new Event('afterprint'));
         const curves = document.getElementById('curves').data;
-        document.title = [onPaper > 3, curves.length > onPaper].join();
-    """
-    assert run_in_page(report, script) == 'true,true'
+        return [onPaper > 3, curves.length > onPaper];
+    """,
+    'life': """
+        const lines = () => [...document.querySelectorAll('#life-table tbody tr')];
+        document.querySelector('#landmarks tbody button').click();
+        const shown = document.querySelector('#life h2').textContent;
+        const whats = lines().map((line) => line.children[3].textContent);
+        return [shown, document.getElementById('life').hidden, whats[0],
+            whats.length > 10, whats.slice(1).every((what) => what.startsWith('used'))];
+    """,
+}
 
 
-@pytest.mark.parametrize('figure', ['map', 'side', 'curves'])
-def test_each_figure_is_saved_as_png_and_as_svg_with_white_paper(report, figure):
-    script = f"""
-        const files = {{}}, found = [], names = [], made = URL.createObjectURL;
-        URL.createObjectURL = (file) => {{
+def test_motion_in_space_has_a_view_that_turns(report, answers):
+    assert not numbers_of(report)['is_flat']
+    assert answers['turned'] == [True, True, False]
+
+
+def test_ellipses_hold_95_percent_in_any_view(answers):
+    assert answers['ellipses']
+
+
+def test_on_paper_each_curve_is_a_figure_of_its_own(answers):
+    assert answers['paper'] == [True, True]
+
+
+def test_a_click_on_a_landmark_shows_what_came_of_each_observation(report, answers):
+    (first, *_) = numbers_of(report)['landmarks']
+    assert answers['life'] == [f'Landmark {first[0]}', False, 'new in the map', True, True]
+
+
+def test_each_figure_is_saved_as_png_and_as_svg_with_white_paper(report):
+    script = (
+        f'const FIGURES = {list(FIGURES)};'
+        + """
+        const files = {}, found = [], names = [], made = URL.createObjectURL;
+        URL.createObjectURL = (file) => {
           const url = made(file);
           files[url] = file;
           return url;
-        }};
-        HTMLAnchorElement.prototype.click = function () {{
+        };
+        HTMLAnchorElement.prototype.click = function () {
           names.push(this.download);
           document.body.dataset.names = names.sort().join();
-          files[this.href].text().then((text) => {{
+          files[this.href].text().then((text) => {
             const isSvg = text.startsWith('<svg');
-            found.push(isSvg ? `svg ${{text.includes('rgb(255, 255, 255)')}}` : text.slice(1, 4));
+            found.push(isSvg ? `svg ${text.includes('rgb(255, 255, 255)')}` : text.slice(1, 4));
             document.title = found.sort().join();
-          }});
-        }};
-        document.querySelectorAll('#save-{figure} button').forEach((button) => button.click());
+          });
+        };
+        FIGURES.forEach((figure) =>
+          document.querySelectorAll(`#save-${figure} button`).forEach((button) => button.click()));
     """
+    )
     opened = opened_with(report, script)
-    assert re.search('<title>([^<]*)', opened.html).group(1) == 'PNG,svg true'
-    assert f'data-names="run_{figure}.png,run_{figure}.svg"' in opened.html
+    saved = 'PNG,PNG,PNG,svg true,svg true,svg true'
+    assert re.search('<title>([^<]*)', opened.html).group(1) == saved
+    names = [f'run_{figure}.{kind}' for figure in FIGURES for kind in ('png', 'svg')]
+    assert f'data-names="{",".join(names)}"' in opened.html
 
 
 def test_a_figure_that_is_saved_is_what_is_seen(report):
@@ -293,20 +325,6 @@ def test_landmarks_that_are_believed_moved_are_marked(slam_observer, tmp_path):
     moved = {numbers['residuals']['id'][row] for row in numbers['residuals']['moved']}
     assert moved == {3}
     assert 'believed moved' in open_page(report).html
-
-
-def test_a_click_on_a_landmark_shows_what_came_of_each_observation(report):
-    script = """
-        const lines = () => [...document.querySelectorAll('#life-table tbody tr')];
-        document.querySelector('#landmarks tbody button').click();
-        const shown = document.querySelector('#life h2').textContent;
-        const whats = lines().map((line) => line.children[3].textContent);
-        document.title = [shown, document.getElementById('life').hidden, whats[0],
-            whats.length > 10, whats.slice(1).every((what) => what.startsWith('used'))].join();
-    """
-    (first, *_) = numbers_of(report)['landmarks']
-    shown = f'Landmark {first[0]},false,new in the map,true,true'
-    assert run_in_page(report, script) == shown
 
 
 @pytest.mark.parametrize('kind', [RANGE, BEARING])

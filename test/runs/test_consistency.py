@@ -20,7 +20,7 @@ from slam_observer_ros.runs.metrics import (
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 
-RUNS = 30
+RUNS = 20
 CHECKPOINT_NS = 2_500_000_000
 
 modes = pytest.mark.parametrize(('two_d_mode', 'degrees_of_freedom'), [(False, 6), (True, 3)])
