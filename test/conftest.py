@@ -10,6 +10,7 @@ from pathlib import Path
 import shutil
 import signal
 import socket
+import sys
 import tempfile
 import time
 from typing import TYPE_CHECKING
@@ -143,6 +144,8 @@ def nothing_is_left_behind() -> Iterator[None]:
     """Fail when a process outlives the tests, and end it; clear away what killed nodes leave."""
     before = set(SHARED_MEMORY.glob(DDS_FILES))
     yield
+    if 'node_processes' in sys.modules:
+        sys.modules['node_processes'].FORKS.end()
     processes = processes_of_these_tests()
     for process_id in processes:
         os.kill(process_id, signal.SIGKILL)

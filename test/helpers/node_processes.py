@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import gc
 import json
+import os
 from pathlib import Path
 import re
 import signal
@@ -38,8 +39,62 @@ ALL_ARE_USED = {'landmarks_max_wait': 60.0}
 """Else an observer drops old landmarks when the tests have a busy machine, as it should."""
 
 
+class Forks:
+    """The program that forks for nodes, and how it is asked."""
+
+    def __init__(self) -> None:
+        self._program: subprocess.Popen[str] | None = None
+
+    def ask(self, **question: object) -> int | None:
+        if self._program is None:
+            self._program = subprocess.Popen(
+                [sys.executable, Path(__file__).with_name('node_forks.py')],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
+            )  # fmt: skip
+        self._program.stdin.write(f'{json.dumps(question)}\n')
+        answer: int | None = json.loads(self._program.stdout.readline())
+        return answer
+
+    def end(self) -> None:
+        """End the program, whose nodes have ended."""
+        if self._program is not None:
+            self._program.communicate(timeout=PATIENCE_S)
+            self._program = None
+
+
+FORKS = Forks()
+
+
+class Fork:
+    """A node that was forked; what `subprocess.Popen` does, as far as tests need it."""
+
+    def __init__(self, name: str, log: Path, arguments: list[str]) -> None:
+        environment = dict(os.environ)
+        self.returncode: int | None = None
+        self.pid = FORKS.ask(name=name, log=str(log), arguments=arguments, environment=environment)
+
+    def poll(self) -> int | None:
+        if self.returncode is None:
+            self.returncode = FORKS.ask(process=self.pid)
+        return self.returncode
+
+    def wait(self, timeout: float = PATIENCE_S) -> int:
+        deadline = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            assert time.monotonic() < deadline, 'the node does not end'
+            time.sleep(0.01)
+        return code
+
+    def send_signal(self, number: signal.Signals) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
 class NodeProcess:
-    """A node as a child process, with its output in a file."""
+    """A node as a process, with its output in a file."""
 
     started: ClassVar[int] = 0
 
@@ -49,15 +104,20 @@ class NodeProcess:
         log: Path,
         *arguments: str,
         program: Path | None = None,
+        is_forked: bool = False,
         **parameters: object,
     ) -> None:
-        """Start a node, or a program of its own in its place."""
+        """Start a node, or a program of its own in its place, or fork one that is loaded."""
         self.log = log
-        module = ['-m', 'slam_observer_ros.nodes.executables', name]
-        command = [sys.executable, *(module if program is None else [str(program)]), '--ros-args']
         always = ALL_ARE_USED if name in OBSERVERS else {}
-        command += _options(always | parameters)
+        arguments = '--ros-args', *_options(always | parameters), *arguments
         NodeProcess.started += 1
+        if is_forked:
+            log.touch()
+            self.process = Fork(name, log, arguments)
+            return
+        module = ['-m', 'slam_observer_ros.nodes.executables', name]
+        command = [sys.executable, *(module if program is None else [str(program)])]
         with log.open('w') as output:
             self.process = subprocess.Popen(
                 [*command, *arguments], stdout=output, stderr=subprocess.STDOUT
@@ -197,7 +257,7 @@ def client() -> Iterator[Client]:
 @contextmanager
 def running(name: str, log: Path, *arguments: str, **parameters: object) -> Iterator[NodeProcess]:
     """Run a node; at the end stop it and check that it ended cleanly."""
-    node = NodeProcess(name, log, *arguments, **parameters)
+    node = NodeProcess(name, log, *arguments, is_forked=True, **parameters)
     try:
         yield node
         assert node.stop() == 0, node.output

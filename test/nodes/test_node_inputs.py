@@ -553,7 +553,9 @@ def test_optional_packages_are_named_when_they_are_missing(tmp_path, monkeypatch
         'ArucoDetection': 'aruco_opencv_msgs',
     }
     nodes = {
-        package: NodeProcess('observer_node', tmp_path / package, landmarks_type=landmarks_type)
+        package: NodeProcess(
+            'observer_node', tmp_path / package, is_forked=True, landmarks_type=landmarks_type
+        )
         for landmarks_type, package in packages.items()
         if importlib.util.find_spec(package) is None
     }

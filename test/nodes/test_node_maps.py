@@ -141,7 +141,9 @@ def initial_pose(pose, frame_id='map', variances=(0.01,) * 6, stamp_ns=None):
 
 def test_saved_killed_loaded_and_localised(ros, robot, tmp_path):
     path = tmp_path / 'map.yaml'
-    first = NodeProcess('observer_node', tmp_path / 'log', map_path=path, **PARAMETERS)
+    first = NodeProcess(
+        'observer_node', tmp_path / 'log', is_forked=True, map_path=path, **PARAMETERS
+    )
     try:
         robot.connect()
         for _ in range(5):
@@ -227,7 +229,7 @@ def test_a_map_that_can_not_be_saved_at_the_end_shows_in_the_exit_code(ros, robo
     folder = tmp_path / 'folder'
     folder.mkdir()
     maps = {'map_path': folder / 'map.yaml', 'autosave_map': True}
-    node = NodeProcess('observer_node', tmp_path / 'log', **maps, **PARAMETERS)
+    node = NodeProcess('observer_node', tmp_path / 'log', is_forked=True, **maps, **PARAMETERS)
     try:
         robot.connect()
         for _ in range(3):
@@ -508,7 +510,7 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
     ],
 )
 def test_with_a_wrong_parameter_the_node_says_why_in_a_line(tmp_path, parameters, reason):
-    node = NodeProcess('observer_node', tmp_path / 'log', **parameters)
+    node = NodeProcess('observer_node', tmp_path / 'log', is_forked=True, **parameters)
     assert node.wait() == 2
     last = node.output.splitlines()[-1]
     assert reason in last
@@ -526,7 +528,9 @@ def test_with_a_wrong_parameter_file_the_node_says_why_in_a_line(tmp_path, text,
     file = tmp_path / 'file.yaml'
     if text is not None:
         file.write_text(text)
-    node = NodeProcess('observer_node', tmp_path / 'log', '--params-file', str(file))
+    node = NodeProcess(
+        'observer_node', tmp_path / 'log', '--params-file', str(file), is_forked=True
+    )
     assert node.wait() == 2
     assert re.search(reason, node.output.splitlines()[-1])
     assert 'Traceback' not in node.output
