@@ -1,1 +1,1 @@
-"""The report of a run: one HTML file that any browser opens, without a network."""
+"""What came of a run, to be looked at: a table, JSON, and pages that need no network."""
