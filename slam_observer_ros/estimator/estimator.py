@@ -350,6 +350,8 @@ class Estimator(Estimate):
         update = self._hypotheses.observe(event)
         if event.kinds is not None:
             update = judged(update, event, self._state)
+            if self._half_points.remember(self._hypotheses.states):
+                update = replace(update, pose=self._state.observer.pose)
         self._timeline.judge_standing(event, update)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late

@@ -19,6 +19,17 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.lie import so3
 
+MEASURED = np.array(
+    [
+        [True, True, True],
+        [False, True, True],
+        [True, False, False],
+        [False, True, False],
+        [True, True, False],
+    ]
+)
+"""Which of range, azimuth and elevation is measured, by kind of point."""
+
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -31,7 +42,7 @@ class Sensed:
     arms: FloatArray  # (m, 3) p, metres
     orientations: FloatArray | None = None  # (m, 3, 3) of tags, zero for none
 
-    def select(self, mask: BoolArray) -> Sensed:
+    def select(self, mask: BoolArray | IntArray) -> Sensed:
         """Return the points that ``mask`` (m,) picks."""
         Z = self.orientations
         return Sensed(
@@ -85,3 +96,24 @@ def directions_of(lines: FloatArray) -> FloatArray:
     elevation = np.cross(along, azimuth)
     directions: FloatArray = np.stack([along, azimuth, elevation], axis=1)
     return directions
+
+
+def completed_lines(shown: FloatArray, expected: FloatArray, kinds: IntArray) -> FloatArray:
+    """Return lines of sight (m, 3) of what is shown, and where that is not measured, expected."""
+    measured_range, measured_azimuth, measured_elevation = MEASURED[kinds].T
+    level = np.hypot(expected[:, 0], expected[:, 1])
+    source = np.where(measured_azimuth[:, None], shown, expected)
+    azimuth = np.arctan2(source[:, 1], source[:, 0])
+    rise = np.arctan2(expected[:, 2], level)
+    rise_shown = np.arctan2(shown[:, 2], np.hypot(shown[:, 0], shown[:, 1]))
+    elevation = np.where(measured_elevation, rise_shown, rise)
+    directions = np.column_stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    lengths = np.linalg.norm(np.where(measured_range[:, None], shown, expected), axis=1)
+    lines: FloatArray = lengths[:, None] * directions
+    return lines

@@ -25,8 +25,9 @@ from slam_observer_ros.filter.robust import (
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import EstimatedAxes, PLANAR
 from slam_observer_ros.lie.matrices import transpose
+from slam_observer_ros.lie.sensor_mounting import MEASURED
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.tracking.half_points import MEASURED, of_axes
+from slam_observer_ros.tracking.half_points import of_axes
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.waiting_room import FEWEST_VIEWS, Window
 
@@ -199,7 +200,8 @@ def _views(window: Window, state: State, known: LandmarkMap) -> Views | None:
         return None
     back = se3.inverse(state.observer.A)
     turns = back[:3, :3] @ np.array([view.pose[:3, :3] for view in views])
-    lines = np.array([view.line for view in views]) @ back[:3, :3].T
+    seen = np.array([view.seen(state) for view in views])
+    lines = seen[:, 1] @ back[:3, :3].T
     lines = np.einsum('nji,nj->ni', turns, lines)  # along the body's axes then
     kinds = of_axes(np.array([view.kind for view in views]), state)
     range_m = np.linalg.norm(lines, axis=1)
@@ -217,7 +219,7 @@ def _views(window: Window, state: State, known: LandmarkMap) -> Views | None:
         landmark_covariances=known.covariances_or(state.settings.map_noise)[named],
         named=named,
         turns=turns,
-        origins=se3.transform(back, np.array([view.origin for view in views])),
+        origins=se3.transform(back, seen[:, 0]),
         ranges=np.where(measured[:, 0], range_m, np.nan),
         directions=partial / np.maximum(level, 1e-9),
         is_direction=is_direction,

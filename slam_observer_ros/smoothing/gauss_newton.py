@@ -21,6 +21,7 @@ from types import ModuleType
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.events import POINT
 from slam_observer_ros.filter.arrays import UNKNOWN_RAD
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import EstimatedAxes, PLANAR
@@ -85,6 +86,7 @@ class Smoother:
         self._link_information = _link_information(keyframes, drifts)
         self._prior_information = inverse(prior.covariance)
         self._is_usual = not axes.turn and not drifts
+        self._are_half = np.flatnonzero(keyframes.kinds != POINT)
 
     def smooth(
         self, start: Solution, iterations: int, tolerance: float, gated: bool = True
@@ -96,6 +98,8 @@ class Smoother:
         ``gated``.
         """
         for _ in range(iterations):
+            if len(self._are_half):
+                self._complete(start)
             factors = ChainFactors(self._linearise(start, gated))
             change, border_change = factors.solve()
             step = Step(start, self._moved(start, change, border_change), factors)
@@ -103,6 +107,12 @@ class Smoother:
                 break
             start = step.end
         return step
+
+    def _complete(self, solution: Solution) -> None:
+        """Complete half points by a solution."""
+        keyframes, sensed = self._observations.completed(solution, self._are_half)
+        self._keyframes, self._sensed = keyframes, sensed
+        self._observations = Observations(self._axes, keyframes, self._settings, sensed)
 
     def motion_errors(self, solution: Solution) -> FloatArray:
         """Return by how much the motions are off (S, d), as right perturbations, rad and m."""

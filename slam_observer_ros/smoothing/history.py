@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.events import POINT
 from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import EstimatedAxes
@@ -45,6 +46,9 @@ class Keyframe(NamedTuple):
     # (m,) how their tags are turned, zero for none; None if that is not estimated
     orientations: SeenOrientations | None = None
     sensed: Sensed | None = None  # (m,) as the sensor showed them, where it is calibrated
+    kinds: IntArray | None = None  # (m,) what is measured of them; None for all of it
+    origins: FloatArray | None = None  # (m, 3) where from; None for the base
+    marks: Sequence[int] = ()  # (m,) of the observations, where they are of several
 
 
 def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:
@@ -55,6 +59,14 @@ def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:
     information = np.linalg.inv(axes.turn_covariances(seen.covariances)).astype(np.float64)
     every = SeenTurns(np.arange(len(seen.rows)), seen.Z, seen.flipped, information)
     return every.without(np.logical_not(seen.Z.any(axis=(1, 2))))
+
+
+def _kinds(keyframe: Keyframe) -> IntArray:
+    return np.full(len(keyframe.rows), POINT) if keyframe.kinds is None else keyframe.kinds
+
+
+def _origins(keyframe: Keyframe) -> FloatArray:
+    return np.zeros_like(keyframe.points) if keyframe.origins is None else keyframe.origins
 
 
 def _all_sensed(seen: list[Keyframe]) -> Sensed | None:
@@ -112,6 +124,8 @@ class History:
         self._latest = self._none
         self._new: list[Keyframe] = []
         self._new_links: list[_Link] = []  # to each of these
+        # Keyframes in which landmarks were seen that are not known yet, by numbers given to them.
+        self._marked: list[tuple[int, int]] = []
 
     def copy(self) -> History:
         """Return an independent history: no array is ever changed in place."""
@@ -162,6 +176,39 @@ class History:
         self._new.append(keyframe)
         self._new_links.append(_Link(start, self._end, *motion, self._calibration, self._slip))
         self._start = self._slip = self._motion = None
+
+    def mark(self, mark: int, stamp_ns: int, pose: FloatArray, calibration: FloatArray) -> None:
+        """Append a keyframe in which landmarks were seen that may be known later."""
+        self._marked.append((mark, len(self.stamps_ns)))
+        nothing = np.empty((0, 3))
+        none = np.empty(0, dtype=np.int64)
+        keyframe = Keyframe(stamp_ns, none, nothing, nothing, None, np.empty(0))
+        self.add(keyframe, pose, calibration)
+
+    def marked(self, marks: Iterable[int]) -> list[int]:
+        """Return the keyframes of marks, −1 where they are not there any more."""
+        numbers = dict(self._marked)
+        return [numbers.get(mark, -1) for mark in marks]
+
+    @property
+    def last_mark(self) -> int:
+        """The last keyframe that is marked, −1 for none."""
+        return self._marked[-1][1] if self._marked else -1
+
+    def as_seen(self, seen: Keyframe, numbers: IntArray) -> Keyframes:
+        """Return what was ``seen`` in several keyframes, as arrays."""
+        return replace(self._as_arrays([seen], [], 0), keyframes=numbers)
+
+    def attach(self, row: int, numbers: IntArray, seen: Keyframe) -> None:
+        """Take what was ``seen`` in keyframes (m,) for all that was seen of a landmark."""
+        more = self.as_seen(seen, numbers)
+        self._change(lambda keyframes: keyframes.only(keyframes.landmarks != row))
+        pieces, first = [*self._summarised, self._latest], 0
+        for number, piece in enumerate(pieces):
+            end = first + len(piece.calibrations)
+            pieces[number] = piece.with_more(more.only((first <= numbers) & (numbers < end)))
+            first = end
+        *self._summarised, self._latest = pieces
 
     def add_calibration(self, values: FloatArray, variances: FloatArray) -> None:
         """Append entries (c,) of a calibration that are estimated from now on."""
@@ -266,18 +313,21 @@ class History:
     def _as_arrays(self, seen: list[Keyframe], links: list[_Link], first: int) -> Keyframes:
         """Return keyframes as arrays; ``first`` is the number of the first one."""
         slips = [number for number, link in enumerate(links, first) if link.slip is not None]
-        k, numbers = self._axes.point, np.arange(first, first + len(seen))
+        k, c = self._axes.point, len(self._calibration)
+        numbers = np.arange(first, first + len(seen))
         return Keyframes(
             links=self._in_frames_of_ends(links),
             slips=np.array(slips, dtype=np.int64),
             slipped=self._in_frames_of_ends([each for link in links for each in link.with_slip]),
-            calibrations=np.array([link.calibration for link in links]),
-            drift_covariances=np.array([link.drift for link in links]),
+            calibrations=np.array([link.calibration for link in links]).reshape(len(links), c),
+            drift_covariances=np.array([link.drift for link in links]).reshape(len(links), c, c),
             keyframes=np.repeat(numbers, [len(part.rows) for part in seen]),
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
             shares=1.0 / np.concatenate([part.repeated for part in seen]),
+            kinds=np.concatenate([_kinds(part) for part in seen]),
+            origins=np.concatenate([_origins(part) for part in seen]),
             turns=self._turns(seen),
             sensed=_all_sensed(seen),
         )

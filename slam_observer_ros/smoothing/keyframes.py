@@ -91,6 +91,8 @@ class Keyframes:
     information: FloatArray  # (M, k, k) inverse covariance of it, body frame, 1/m²
     # (M,) how much of it counts: less than 1 where its error is partly that of a point before
     shares: FloatArray
+    kinds: IntArray  # (M,) what is measured of it; the rest is completed at each iteration
+    origins: FloatArray  # (M, 3) where it was measured from, metres, body frame
     turns: SeenTurns  # of the tags among them, where orientations are estimated
     sensed: Sensed | None = None  # (M,) as the sensors showed them, where these are calibrated
 
@@ -103,16 +105,18 @@ class Keyframes:
 
     def only(self, kept: BoolArray) -> Keyframes:
         """Return the keyframes with only some of the points (M,)."""
-        return replace(
-            self,
-            keyframes=self.keyframes[kept],
-            landmarks=self.landmarks[kept],
-            points=self.points[kept],
-            information=self.information[kept],
-            shares=self.shares[kept],
-            turns=self.turns.only(kept),
-            sensed=None if self.sensed is None else self.sensed.select(kept),
-        )
+        own = {name: getattr(self, name)[kept] for name in _OF_SEEN}
+        sensed = None if self.sensed is None else self.sensed.select(kept)
+        return replace(self, **own, turns=self.turns.only(kept), sensed=sensed)
+
+    def with_more(self, seen: Keyframes) -> Keyframes:
+        """Return the same with more points seen in these keyframes."""
+        every = joined([self, seen])
+        order = np.argsort(every.keyframes, kind='stable')
+        turns = replace(every.turns, points=np.argsort(order)[every.turns.points])
+        own = {name: getattr(every, name)[order] for name in _OF_SEEN}
+        sensed = None if every.sensed is None else every.sensed.select(order)
+        return replace(every, **own, turns=turns, sensed=sensed)
 
     def with_calibration(self, values: FloatArray) -> Keyframes:
         """Return the same with more of a calibration (c,), which was of no effect before."""
@@ -154,6 +158,7 @@ def joined(parts: list[Keyframes]) -> Keyframes:
 
 
 _OF_PARTS = 'links', 'slipped', 'turns', 'sensed'
+_OF_SEEN = 'keyframes', 'landmarks', 'points', 'information', 'shares', 'kinds', 'origins'
 
 
 def _joined_links(parts: list[Links]) -> Links:
@@ -183,6 +188,8 @@ def no_keyframes(d: int, c: int, k: int, q: int) -> Keyframes:
         points=np.empty((0, 3)),
         information=np.empty((0, k, k)),
         shares=np.empty(0),
+        kinds=none,
+        origins=np.empty((0, 3)),
         turns=no_turns(q),
     )
 

@@ -7,6 +7,7 @@ What a calibrated sensor shows, y and Z, depends on its calibration, too.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -16,12 +17,22 @@ from slam_observer_ros.filter.arrays import flip_verdicts
 from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.axes import EstimatedAxes
 from slam_observer_ros.lie.matrices import transpose
-from slam_observer_ros.lie.sensor_mounting import Sensed, sensitivity, shown_at, turning
+from slam_observer_ros.lie.sensor_mounting import (
+    completed_lines,
+    directions_of,
+    Sensed,
+    sensitivity,
+    shown_at,
+    turning,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 
 FlatSensed: TypeAlias = tuple[IntArray, FloatArray, FloatArray, FloatArray, IntArray]
 """What C reads of the sensors of M points, see :meth:`SensedPoints.flat`."""
+
+LEAST_M = 0.05
+"""Least distance of a landmark whose direction is measured: the sensor has an extent."""
 
 NO_SENSORS = None, None, None, np.empty((0, 7)), np.empty((0, 7), dtype=np.int64)
 """The same where none is calibrated."""
@@ -57,6 +68,30 @@ class SensedPoints:
         estimated = np.append(calibration, 0.0)[columns]
         values = np.where(columns >= 0, estimated, stated)
         return sensed.sensors, sensed.origins, sensed.arms, values, columns
+
+    def completed(
+        self,
+        half: IntArray,
+        calibrations: FloatArray,
+        predicted: FloatArray,
+        kinds: IntArray,
+        k: int,
+    ) -> tuple[SensedPoints, FloatArray, FloatArray]:
+        """Return the same with points ``half`` (h,) as predicted (h, 3) where not measured.
+
+        And their lines of sight (h, 3) before and after, body frame.
+        """
+        values, sensed = self._values(calibrations)[half], self._sensed
+        R, scales = so3.exp(values[:, :3]), np.exp(values[:, 6:])
+        lines = predicted - sensed.origins[half] - values[:, 3:6]
+        lines[:, k:] = 0.0
+        expected = (transpose(R) @ lines[:, :, None])[:, :, 0] / scales
+        arms = sensed.arms.copy()
+        arms[half] = completed_lines(arms[half], expected, kinds)
+        before, after = ((R @ each[half, :, None])[:, :, 0] for each in (sensed.arms, arms))
+        shown, c = replace(sensed, arms=arms), calibrations.shape[1]
+        changed = SensedPoints(shown, *self._of_sensors, c)
+        return changed, scales * before, scales * after
 
     def turns(self, calibrations: FloatArray) -> FloatArray:
         """Return exp(ψ) (M, 3, 3), by which seen orientations are turned."""
@@ -126,6 +161,28 @@ class Observations:
         H[tags] += of_turns[0]
         gradient[tags] += of_turns[1]
         return H, gradient
+
+    def completed(
+        self, solution: Solution, half: IntArray
+    ) -> tuple[Keyframes, SensedPoints | None]:
+        """Return keyframes and sensors' points with half points as a solution has the rest."""
+        keyframes, k, sensed = self._keyframes, self._axes.point, self._sensed
+        predicted, kinds = self._of_points(solution)[1][half], keyframes.kinds[half]
+        points = keyframes.points
+        if sensed is None:
+            origins = keyframes.origins[half]
+            before, expected = points[half] - origins, predicted - origins
+            expected[:, k:] = 0.0
+            after = completed_lines(before, expected, kinds)
+            points = points.copy()
+            points[half] = origins + after
+        else:
+            sensed, before, after = sensed.completed(
+                half, self._calibrations(solution), predicted, kinds, k
+            )
+        information = keyframes.information.copy()
+        information[half] = _along(before, after, information[half])
+        return replace(keyframes, points=points, information=information), sensed
 
     def some_are_gated(self, solution: Solution) -> bool:
         """Return whether a filter would reject some of the points."""
@@ -216,6 +273,22 @@ def _joined(
         return np.concatenate([by_pose, by_landmark, by_sensors], axis=2)
     unseen = np.zeros((M, k, chained - sensors))
     return np.concatenate([by_pose, unseen, by_sensors, by_landmark], axis=2)
+
+
+def _along(before: FloatArray, after: FloatArray, information: FloatArray) -> FloatArray:
+    """Return the information (h, k, k) of points on other lines of sight (h, 3).
+
+    Along, in azimuth and in elevation it is as before; angles stay as well known as they were.
+    """
+    k = information.shape[1]
+    lines = [each * (np.arange(3) < k) for each in (before, after)]
+    old, new = (directions_of(each)[:, :, :k] for each in lines)
+    lengths = [np.maximum(np.linalg.norm(each, axis=1), LEAST_M) for each in lines]
+    shares = np.ones((len(before), 3, 1))
+    shares[:, 1:, 0] = (lengths[0] / lengths[1])[:, None]
+    turned = transpose(new) @ (shares * old)
+    along: FloatArray = turned @ information @ transpose(turned)
+    return along
 
 
 def normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -17,10 +17,12 @@ from :data:`MAX_UNKNOWNS` on they are not relinearised, either.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import copy
+from dataclasses import replace
 import logging
 import math
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -31,6 +33,7 @@ from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.observer import Observer
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.lie.sensor_mounting import MEASURED
 from slam_observer_ros.models.calibration import Calibration
 from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.models.observation_noise import ObservationNoise
@@ -53,6 +56,9 @@ them costs no more than an update, O(n²).
 MAX_INTERVAL = 300
 """Observations that are enough, however many there were before."""
 
+MOST_AWAITED = 1000
+"""Keyframes that are kept for landmarks that may enter: as many cost some milliseconds."""
+
 MAX_UNKNOWNS = 600
 """Most unknowns of a map that is relinearised, in some tenths of a second: 100 tags in space."""
 
@@ -71,11 +77,19 @@ until then observations are linearised at the wrong estimate.
 ITERATIONS, TOLERANCE = 2, 2e-2
 """Steps at most; change of pose and map, rad and m, below which one will do."""
 
+ENTRY_ITERATIONS = 10
+"""Steps at most where a landmark enters, by which all since it was seen first is corrected."""
+
 SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
 """The same for smoothing everything."""
 
 SLIP_TOLERANCE = 1e-4
 """Change below which a solution will do to judge slips by."""
+
+
+Place: TypeAlias = tuple[FloatArray, FloatArray]
+"""Where a landmark is (3,), and its covariance (k, k) as seen from the robot, by given scales of
+ranges and mountings of sensors, m²."""
 
 
 class KnownErrors(Protocol):
@@ -128,6 +142,23 @@ class Past:
 
     def add(self, keyframe: Keyframe, in_doubt: bool) -> None:
         """Add a keyframe, of a landmark ``in_doubt`` or none."""
+
+    def mark(self, mark: int, stamp_ns: int) -> None:
+        """Mark an observation of landmarks that may be known later by a number."""
+
+    def poses_of(self, marks: Iterable[int]) -> list[FloatArray | None]:
+        """Return the poses (4, 4) of marked observations; None where that is not known."""
+        return [None for _ in marks]
+
+    def placed(self, point: FloatArray, seen: Keyframe) -> Place | None:
+        """Return where a landmark is that was ``seen`` in marked observations, near a point (3,).
+
+        By all that was seen since the summary. None where that is not kept, or leaves it open.
+        """
+        return None
+
+    def enter(self, row: int, seen: Keyframe) -> None:
+        """Let marked observations (m,) be all that a landmark was ``seen`` in."""
 
     def add_calibration(self) -> None:
         """Note entries of the calibration that are estimated from now on."""
@@ -242,6 +273,73 @@ class Relinearisation(Past):
         elif self._window_is_full or self._is_due:
             self._sum_up(self._relinearise())
 
+    def mark(self, mark: int, stamp_ns: int) -> None:
+        """Mark an observation of landmarks that may be known later by a number."""
+        if self.is_active:
+            A, values = self._observer.A.copy(), self._calibration.values
+            self.history.mark(mark, stamp_ns, A, values)
+
+    def poses_of(self, marks: Iterable[int]) -> list[FloatArray | None]:
+        """Return the poses (4, 4) of marked observations; None where that is not known."""
+        history = self.history
+        return [None if at < 0 else history.poses[at + 1] for at in history.marked(marks)]
+
+    def placed(self, point: FloatArray, seen: Keyframe) -> Place | None:
+        """Return where a landmark is that was ``seen`` in marked observations, near a point (3,).
+
+        By all that was seen since the summary. None where that is not kept, or leaves it open.
+        """
+        history, first = self.history, self.history.summarised
+        numbers = np.array(history.marked(seen.marks))
+        if not (self.is_active and self._is_dense) or numbers.min() < first:
+            return None
+        solution = self._solution_from(first)
+        row = len(solution.points)
+        views = history.as_seen(seen._replace(rows=np.full(len(numbers), row)), numbers - first)
+        solution = replace(
+            solution,
+            points=np.concatenate([solution.points, point[None]]),
+            orientations=np.concatenate([solution.orientations, np.zeros((1, 3, 3))]),
+        )
+        try:
+            smoother = self._smoother(history.summary, history.latest_keyframes().with_more(views))
+            step = smoother.smooth(solution, ENTRY_ITERATIONS, TOLERANCE)
+            covariance = step.marginal()
+        except np.linalg.LinAlgError:
+            return None
+        found = step.end.points[row]
+        if not _is_ahead(found, step.end.poses[numbers - first + 1], seen):
+            return None  # another minimum
+        (d, k), c = (self._axes.p, self._axes.point), self._calibration.count
+        pose = step.end.poses[-1]
+        y = se3.transform(se3.inverse(pose), found[None])
+        J = np.zeros((k, len(covariance)))
+        J[:, :d] = -self._axes.output_matrix(y)[0]
+        at = d + c + (k + self._axes.turn) * row
+        J[:, at : at + k] = pose[:k, :k].T
+        of_sensors = np.eye(len(covariance))[d + self._calibration.of_velocity : d + c]
+        joint = np.concatenate([J, of_sensors])
+        joint = joint @ covariance @ joint.T
+        shared = joint[:k, k:] @ np.linalg.pinv(joint[k:, k:])
+        there = se3.transform(history.poses[-1], y)[0]
+        return there, joint[:k, :k] - shared @ joint[k:, :k]
+
+    def enter(self, row: int, seen: Keyframe) -> None:
+        """Let marked observations (m,) be all that a landmark was ``seen`` in.
+
+        What is not kept any more stays in what the filter has made of it.
+        """
+        numbers = np.array(self.history.marked(seen.marks))
+        if not self.is_active or numbers.min() < 0:
+            return
+        self.history.attach(row, numbers, seen._replace(rows=np.full(len(numbers), row)))
+        if not self._is_dense:
+            return
+        are_latest = numbers.min() >= self.history.summarised
+        if not (are_latest and self._relinearise(ENTRY_ITERATIONS)):
+            self.history.summarise(self._known().least_nonlinear(self._axes)[0])
+            self._clear_counts()
+
     def add_calibration(self) -> None:
         """Note entries of the calibration that are estimated from now on."""
         known = len(self.history.calibrations[-1])
@@ -338,6 +436,13 @@ class Relinearisation(Past):
         return 0 < self._settings.smoothing_window <= len(self.history.stamps_ns)
 
     @property
+    def _is_awaited(self) -> bool:
+        """Whether landmarks may enter that were seen since the summary."""
+        history = self.history
+        is_short = len(history.stamps_ns) - history.summarised < MOST_AWAITED
+        return is_short and history.last_mark >= history.summarised
+
+    @property
     def _is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
         if self._is_overdue:  # a landmark that may have moved kept it from being summed up
@@ -359,10 +464,10 @@ class Relinearisation(Past):
         known, angle_rad = self._known().least_nonlinear(self._axes)
         if self._window_is_full:
             self._start(known, CUT)
-        elif is_done and angle_rad < MAX_TURN_RAD:
+        elif is_done and angle_rad < MAX_TURN_RAD and not self._is_awaited:
             self.history.summarise(known)
 
-    def _relinearise(self) -> bool:
+    def _relinearise(self, iterations: int = ITERATIONS) -> bool:
         """Relinearise the keyframes that are not summarised at the present estimates, if possible.
 
         Return whether it was: if they don't determine everything, more may do so later.
@@ -374,7 +479,7 @@ class Relinearisation(Past):
         try:
             smoother = self._smoother(history.summary, history.latest_keyframes())
             start = self._without_outliers_of_then(smoother, self._solution_from(first))
-            step = smoother.smooth(start, ITERATIONS, TOLERANCE)
+            step = smoother.smooth(start, iterations, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             self._warning.give()
@@ -436,6 +541,14 @@ class Relinearisation(Past):
         values = self._calibration.values
         orientations = observer.orientations.B[: len(points)].copy()
         return Prior(observer.A.copy(), values, points, orientations, P)
+
+
+def _is_ahead(point: FloatArray, poses: FloatArray, seen: Keyframe) -> bool:
+    """Return whether a point (3,) is where directions seen from poses (m, 4, 4) lead."""
+    back = se3.inverse(poses)
+    lines = back[:, :3, :3] @ point + back[:, :3, 3] - (seen.points - seen.lines_of_sight)
+    ahead = np.einsum('mi,mi->m', lines, seen.lines_of_sight)
+    return not (MEASURED[seen.kinds][:, 1] & (ahead < 0.0)).any()
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:

@@ -10,13 +10,13 @@ directions and a completed point are the same correction, but for rounding.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Outcomes, Reason, Update
 from slam_observer_ros.events import (
     AZIMUTH,
@@ -28,31 +28,17 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.filter.robust import straight_odds, straight_share
 from slam_observer_ros.lie.matrices import diagonal_blocks
-from slam_observer_ros.lie.sensor_mounting import directions_of
+from slam_observer_ros.lie.sensor_mounting import completed_lines, directions_of, MEASURED
 from slam_observer_ros.models.observation_noise import point_covariances
 from slam_observer_ros.tracking.matching import calibrated, residuals_of
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.waiting_room import (
     LEAST_MOVE_M,
     sensor_values,
+    UNMEASURED_M,
     WaitingRoom,
     Window,
 )
-
-UNMEASURED_M = 1e3
-"""Standard deviation of a completed point where nothing was measured: as large as a message may
-state one."""
-
-MEASURED = np.array(
-    [
-        [True, True, True],
-        [False, True, True],
-        [True, False, False],
-        [False, True, False],
-        [True, True, False],
-    ]
-)
-"""Which of range, azimuth and elevation is measured, by kind."""
 
 KEPT, FEWEST = 200, 40
 """Differences of ranges that are kept, and that it takes to judge them."""
@@ -83,6 +69,13 @@ class HalfPoints:
         """Forget the views that wait: time or frame are others."""
         self._waiting, self.window = WaitingRoom(), Window()
         self.offsets = RangeOffsets()
+
+    def remember(self, states: Sequence[State]) -> bool:
+        """Let the pasts of ``states`` know what is seen by the views that wait, or waited.
+
+        Return whether a landmark has entered since the last time, which may move the robot.
+        """
+        return self._waiting.remember(states)
 
     @property
     def open_sides(self) -> list[int]:
@@ -129,6 +122,7 @@ class HalfPoints:
                 self.window.add(state, event, row, measured[row])
         if state.is_mapping:
             is_new = (rows < 0) & (event.kinds != POINT) & ~is_sought
+            self._waiting.begin(event.stamp_ns)
             for row in np.flatnonzero(is_new).tolist():
                 found = self._waiting.add(state, event, row, covariances[row])
                 if found is not None:
@@ -304,7 +298,7 @@ def _completed(
     if known.any():
         expected[known] = expected_lines(state, event.select(known), rows[known])
     kinds = of_axes(event.kinds, state)
-    lines = _combined(shown, expected, MEASURED[kinds])
+    lines = completed_lines(shown, expected, kinds)
     return lines, _covariances(state, event, lines, kinds)
 
 
@@ -319,34 +313,13 @@ def of_axes(kinds: IntArray | None, state: State) -> IntArray:
 
 def expected_lines(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
     """Return how a sensor would show landmarks ``rows`` (m,), by its calibration, body axes."""
-    R, shift, scale = sensor_values(state, event)
+    R, shift, scale = sensor_values(state, event.sensor_frame)
     origins = event.points - event.lines_of_sight + shift
     lines = state.observer.body_points(rows) - origins
     if state.axes.point == 2:
         lines[:, 2] = 0.0
     shown: FloatArray = lines @ R / scale
     return shown
-
-
-def _combined(shown: FloatArray, expected: FloatArray, measured: BoolArray) -> FloatArray:
-    """Return lines of sight (m, 3) of what is ``measured`` (m, 3), and of what is expected."""
-    measured_range, measured_azimuth, measured_elevation = measured.T
-    level = np.hypot(expected[:, 0], expected[:, 1])
-    source = np.where(measured_azimuth[:, None], shown, expected)
-    azimuth = np.arctan2(source[:, 1], source[:, 0])
-    rise = np.arctan2(expected[:, 2], level)
-    rise_shown = np.arctan2(shown[:, 2], np.hypot(shown[:, 0], shown[:, 1]))
-    elevation = np.where(measured_elevation, rise_shown, rise)
-    directions = np.column_stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
-    lengths = np.linalg.norm(np.where(measured_range[:, None], shown, expected), axis=1)
-    lines: FloatArray = lengths[:, None] * directions
-    return lines
 
 
 def _covariances(

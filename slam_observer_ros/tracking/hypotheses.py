@@ -142,6 +142,11 @@ class Hypotheses:
         return self._all[0].state
 
     @property
+    def states(self) -> list[State]:
+        """All states, the most likely one first."""
+        return [hypothesis.state for hypothesis in self._all]
+
+    @property
     def missed(self) -> float:
         """Landmarks that should have been among the points without ids seen last, and were not."""
         return self._all[0].visibility.missed
@@ -277,7 +282,7 @@ class Hypotheses:
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
-        states = [hypothesis.state for hypothesis in self._all]
+        states = self.states
         rows = [state.landmarks.rows_of(np.array([landmark_id])) for state in states]
         for state, row in zip(states, rows, strict=True):
             if row[0] >= 0:

@@ -136,6 +136,8 @@ def keyframe_of(
         repeated,
         orientations,
         event.sensed,
+        event.kinds,
+        event.sensor,
     )
 
 

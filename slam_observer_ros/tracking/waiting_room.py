@@ -3,13 +3,16 @@
 k half measurements and the way between them are one point, seen now, with a covariance: by
 generalised least squares from starts all around, where the noise of the way is a random walk
 between the views. Two minima that both fit, as on both sides of a straight way, are left open
-until a curve decides. What has been used so is used up.
+until a curve decides. Where the past is kept, all that is known since says whether the place is
+sure, and the views take the place of the point once it has entered.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 import math
 from typing import TYPE_CHECKING
 
@@ -19,9 +22,11 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, RANGE
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.lie.sensor_mounting import directions_of
+from slam_observer_ros.lie.sensor_mounting import directions_of, MEASURED, Sensed
+from slam_observer_ros.smoothing.history import Keyframe
 
 if TYPE_CHECKING:
+    from slam_observer_ros.smoothing.relinearisation import Place
     from slam_observer_ros.tracking.state import State
 
 MOST_VIEWS, FEWEST_VIEWS = 80, 8
@@ -33,10 +38,13 @@ TRY_AGAIN, MOST_BETWEEN = 1.3, 40
 LEAST_MOVE_M, LEAST_TURN_RAD = 0.05, 0.05
 """By how much a view differs from the last one: from one place all have the same error."""
 
+FURTHEST_RAD = 0.7
+"""Deviation of a turn since a view from which it says no more where a landmark is: 40°."""
+
 MOST_TURN_RAD = 0.3
 """Standard deviation of a turn up to which the way since a view is known well: it is linear."""
 
-SURE = 0.1
+SURE_RANGES, SURE_BEARINGS = 0.05, 0.25
 """Largest standard deviation of a point, as a share of its distance, that is linear enough."""
 
 FITS, APART = 2.5, 30.0
@@ -48,6 +56,13 @@ The odds of the side are e^15 then, beside errors of the way that are twice as s
 SIDE = 3.0
 """Times the noise of the way by which views lie off a straight line, if that decides a side."""
 
+UNMEASURED_M = 1e3
+"""Standard deviation of a completed point where nothing was measured: as large as a message may
+state one."""
+
+MOST_AT_ONCE = 4
+"""Sensors, or kinds of views of one, that may show a landmark at once."""
+
 HUBER, STEPS = 2.0, 15
 DEPTHS_M = (1.0, 4.0, 15.0)
 """Distances along a bearing from which a solution is sought."""
@@ -57,12 +72,14 @@ DEPTHS_M = (1.0, 4.0, 15.0)
 class WaitingView:
     """One half measurement, and from where: in the frame of P°."""
 
+    number: int  # of the observation
+    stamp_ns: int
     landmark_id: int
     kind: int
     sensor_frame: str
     pose: FloatArray  # (4, 4) of the body
-    origin: FloatArray  # (3,) of the sensor
-    line: FloatArray  # (3,) of sight, as measured
+    mount: FloatArray  # (3,) where the sensor is said to be, body axes
+    shown: FloatArray  # (3,) line of sight as it was shown, body axes
     variances: FloatArray  # (3,) along it, and across it in rad²
     walk: FloatArray  # (6, 6) covariance of the way until then
 
@@ -72,10 +89,18 @@ class WaitingView:
         return self.kind == RANGE
 
     def is_near(self, other: WaitingView, times: float = 1.0) -> bool:
-        """Return whether the sensor has moved less than it takes between this view and another."""
-        turn = np.linalg.norm(se3.log(se3.inverse(self.pose) @ other.pose)[:3])
-        moved_m = float(np.linalg.norm(self.origin - other.origin))
-        return moved_m < times * LEAST_MOVE_M and float(turn) < times * LEAST_TURN_RAD
+        """Return whether the robot has moved less than it takes between this view and another."""
+        way = se3.log(se3.inverse(self.pose) @ other.pose)
+        turn, moved_m = np.linalg.norm(way[:3]), np.linalg.norm(way[3:])
+        return bool(moved_m < times * LEAST_MOVE_M and turn < times * LEAST_TURN_RAD)
+
+    def seen(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Return where the sensor was, and its line of sight as calibrated now: (3,) each."""
+        R, shift, scale = sensor_values(state, self.sensor_frame)
+        flat = np.array([1.0, 1.0, float(state.axes.point == 3)])
+        origin, line = (self.mount + shift) * flat, scale * (R @ self.shown) * flat
+        turn = self.pose[:3, :3]
+        return turn @ origin + self.pose[:3, 3], turn @ line
 
 
 class Way:
@@ -101,28 +126,24 @@ class Way:
             self._last_ns, self._last_pose = stamp_ns, A.copy()
 
     def view(
-        self, state: State, event: ObservationEvent, row: int, covariance: FloatArray
+        self, state: State, event: ObservationEvent, row: int, covariance: FloatArray, number: int
     ) -> WaitingView:
         """Return the half point at ``row``, with the covariance (3, 3) of its line of sight."""
-        A = state.observer.A.copy()
-        R, shift, scale = sensor_values(state, event)
-        origin = event.points[row] - event.lines_of_sight[row] + shift
-        line = scale * (R @ event.lines_of_sight[row])
+        shown = event.lines_of_sight[row]
         kind = int(np.asarray(event.kinds)[row])
-        basis = directions_of(line[None])[0]
+        basis = directions_of(shown[None])[0]
         variances = np.einsum('ij,jk,ik->i', basis, covariance, basis)
         if kind != RANGE:
-            variances[1:] /= max(float(line @ line), 1e-9)
-        if state.axes.point == 2:
-            origin, line = origin * [1.0, 1.0, 0.0], line * [1.0, 1.0, 0.0]
-        R_A, x_A = A[:3, :3], A[:3, 3]
+            variances[1:] /= max(float(shown @ shown), 1e-9)
         return WaitingView(
+            number,
+            event.stamp_ns,
             int(event.ids[row]),
             kind,
             event.sensor_frame,
-            A,
-            R_A @ origin + x_A,
-            R_A @ line,
+            state.observer.A.copy(),
+            event.points[row] - shown,
+            shown,
             variances,
             self.covariance,
         )
@@ -144,7 +165,7 @@ class Window:
     def add(self, state: State, event: ObservationEvent, row: int, covariance: FloatArray) -> None:
         """Add the half point at ``row``, unless its landmark was seen nearby already."""
         self.way.go_on(state, event.stamp_ns)
-        view, turned = self.way.view(state, event, row, covariance), state.axes.turned
+        view, turned = self.way.view(state, event, row, covariance, 0), state.axes.turned
         if not self._takes(view):
             return
         self.seen += 1
@@ -174,7 +195,15 @@ class WaitingRoom:
         self._seen: dict[int, int] = {}  # views of each, and …
         self._next: dict[int, int] = {}  # … how many it takes until it is tried again
         self._way = Way()
+        self._observations = self._stamp_ns = 0
+        self._has_new = False  # views, since all was remembered
+        self._entered: dict[int, list[WaitingView]] = {}  # since then
         self.open_sides: set[int] = set()  # ids whose views fit two places
+
+    def begin(self, stamp_ns: int) -> None:
+        """Begin with another observation."""
+        self._observations += 1
+        self._stamp_ns = stamp_ns
 
     def add(
         self, state: State, event: ObservationEvent, row: int, covariance: FloatArray
@@ -184,49 +213,120 @@ class WaitingRoom:
         Both are body axes, as the sensor would have shown the point now.
         """
         self._way.go_on(state, event.stamp_ns)
-        view = self._way.view(state, event, row, covariance)
+        view = self._way.view(state, event, row, covariance, self._observations)
         landmark_id = view.landmark_id
         views = self._views.setdefault(landmark_id, deque(maxlen=MOST_VIEWS))
-        if views and views[-1].is_near(view):
+        of_sensor = view.kind, view.sensor_frame
+        if any(
+            (last.kind, last.sensor_frame) == of_sensor and last.is_near(view)
+            for last in islice(reversed(views), MOST_AT_ONCE)
+        ):
             return None
+        turned = state.axes.turned
+        while views and np.diagonal(view.walk - views[0].walk)[turned].max() > FURTHEST_RAD**2:
+            views.popleft()
         views.append(view)
+        self._has_new = True
         seen = self._seen[landmark_id] = self._seen.get(landmark_id, 0) + 1
-        if seen < self._next.get(landmark_id, FEWEST_VIEWS):
+        if len(views) < FEWEST_VIEWS or seen < self._next.get(landmark_id, 0):
             return None
         self._next[landmark_id] = min(math.ceil(TRY_AGAIN * seen), seen + MOST_BETWEEN)
-        problem = _PlaceProblem(list(views), self._way.covariance, state.axes.point)
+        poses = state.relinearisation.poses_of(each.number for each in views)
+        now = [
+            each if pose is None else replace(each, pose=pose)
+            for each, pose in zip(views, poses, strict=True)
+        ]
+        problem = _PlaceProblem(now, self._way.covariance, state)
         found = problem.solve(state.settings.range_scale_stddev)
         self.open_sides.discard(landmark_id)
         if found is None:
             if problem.side_is_open:
                 self.open_sides.add(landmark_id)
             return None
+        # All that is known since of where the robot was says more than odometry alone.
+        earlier = [each for each in views if each.number < self._observations]
+        start = problem.nearer(found[0])
+        place = state.relinearisation.placed(start, _as_seen(state, earlier)) or found
+        if not _is_sure(state, view, place):
+            return None
+        point, of_point = place[0], found[1]
+        self._entered[landmark_id] = list(views)
         for kept in (self._views, self._seen, self._next):
             del kept[landmark_id]
-        point, of_point = found
-        R, _, scale = sensor_values(state, event)
-        in_body = view.pose[:3, :3].T @ (point - view.origin)
+        R, _, scale = sensor_values(state, view.sensor_frame)
+        in_body = view.pose[:3, :3].T @ (point - view.seen(state)[0])
         turned = R.T @ view.pose[:3, :3].T
         return R.T @ in_body / scale, turned @ of_point @ turned.T / scale**2
 
+    def remember(self, states: Sequence[State]) -> bool:
+        """Keep views, to be linearised again; return whether a landmark has entered."""
+        entered, self._entered = self._entered, {}
+        has_new, self._has_new = self._has_new, False
+        for state in states:
+            if has_new:
+                state.relinearisation.mark(self._observations, self._stamp_ns)
+            for landmark_id, views in entered.items():
+                (row,) = state.landmarks.rows_of(np.array([landmark_id])).tolist()
+                if row >= 0:
+                    state.relinearisation.enter(row, _as_seen(state, views))
+        return bool(entered)
 
-def sensor_values(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray, float]:
+
+def _is_sure(state: State, view: WaitingView, place: Place) -> bool:
+    """Return whether a place is known so well that what is seen of it is linear."""
+    k, (point, covariance) = state.axes.point, place
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:k, :k])[-1]))
+    sure = SURE_RANGES if view.is_range else SURE_BEARINGS
+    return sigma_m < sure * float(np.linalg.norm(point - view.seen(state)[0]))
+
+
+def _as_seen(state: State, views: list[WaitingView]) -> Keyframe:
+    """Return views of a landmark to be linearised again."""
+    calibration = state.calibration
+    shown, mounts = np.array([each.shown for each in views]), np.array([e.mount for e in views])
+    kinds = np.array([each.kind for each in views])
+    basis, lengths = directions_of(shown), np.linalg.norm(shown, axis=1)
+    variances = np.array([each.variances for each in views])
+    variances[:, 1:] *= lengths[:, None] ** 2
+    variances = np.where(MEASURED[kinds], variances, UNMEASURED_M**2)
+    covariances = np.einsum('mij,mi,mik->mjk', basis, variances, basis)
+    sensed = None
+    if calibration.corrects_points:
+        numbers = [calibration.sensors.index(each.sensor_frame) for each in views]
+        sensed = Sensed(np.array(numbers), mounts, shown)
+    since_s = np.diff([each.stamp_ns for each in views]) * 1e-9
+    repeated = state.observation_noise.repetitions(np.append(np.inf, since_s))
+    return Keyframe(
+        views[-1].stamp_ns,
+        np.empty(0, dtype=np.int64),
+        mounts + shown,
+        shown,
+        covariances,
+        repeated,
+        sensed=sensed,
+        kinds=kinds,
+        origins=mounts,
+        marks=[each.number for each in views],
+    )
+
+
+def sensor_values(state: State, frame: str) -> tuple[FloatArray, FloatArray, float]:
     """Return how a sensor is turned (3, 3), shifted (3,), and how much longer its ranges are."""
     calibration = state.calibration
     if not calibration.corrects_points:
         return np.eye(3), np.zeros(3), 1.0
-    values = calibration.sensor(event.sensor_frame)
+    values = calibration.sensor(frame)
     return so3.exp(values[:3]), values[3:6], math.exp(values[6])
 
 
 class _PlaceProblem:
     """Where a landmark is (k,), by views and the way between them."""
 
-    def __init__(self, views: list[WaitingView], walk: FloatArray, k: int) -> None:
-        self._k, self._views = k, views
+    def __init__(self, views: list[WaitingView], walk: FloatArray, state: State) -> None:
+        self._k, self._views = state.axes.point, views
         self.side_is_open = False  # as the solution has shown
-        self._origins = np.array([view.origin for view in views])
-        self._lines = np.array([view.line for view in views])
+        seen = np.array([view.seen(state) for view in views])
+        self._origins, self._lines = seen[:, 0], seen[:, 1]
         self._lengths = np.linalg.norm(self._lines, axis=1)
         self._is_range = np.array([view.is_range for view in views])
         self._variances = np.array([view.variances for view in views])
@@ -243,7 +343,7 @@ class _PlaceProblem:
         A common factor of the ranges moves it along the line of sight, which the step knows, and
         a little otherwise, which is added to the covariance.
         """
-        if self._is_range.any() and not self._curve_decides():
+        if self._is_range.all() and not self._curve_decides():
             self.side_is_open = True
             return None
         solutions = [each for p in self._starts() if (each := self._descend(p)) is not None]
@@ -253,9 +353,7 @@ class _PlaceProblem:
         mirrored = self._descend(self._mirrored(best[1])) if self._is_range.any() else None
         solutions += [] if mirrored is None else [mirrored]
         cost, p, C = min(solutions, key=lambda each: each[0])
-        distance_m = float(np.linalg.norm(p - self._origins[-1]))
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(C)[-1]))
-        if cost > FITS * len(self._views) or sigma_m > SURE * distance_m:
+        if cost > FITS * len(self._views):
             return None
         for other_cost, q, _ in solutions:
             d = (q - p)[: self._k]
@@ -272,6 +370,18 @@ class _PlaceProblem:
         covariance = np.zeros((3, 3))
         covariance[: self._k, : self._k] = C
         return p, covariance
+
+    def nearer(self, p: FloatArray) -> FloatArray:
+        """Return a point on the way to p (3,), no further off than the views lie apart.
+
+        A direction is nearly linear in 1/distance: from further off steps lead beyond the robot.
+        """
+        if self._is_range.any():
+            return p
+        off = p - self._origins[-1]
+        apart_m = float(np.linalg.norm(np.ptp(self._origins, axis=0)))
+        nearer: FloatArray = self._origins[-1] + off * min(apart_m / np.linalg.norm(off), 1.0)
+        return nearer
 
     def _starts(self) -> list[FloatArray]:
         origin = self._origins[-1]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from slam_observer_ros.events import POINT
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import (
@@ -84,6 +85,8 @@ class Problem:
             seen,
             np.linalg.inv(random_covariances(rng, len(keyframes), k, 0.1)),
             rng.uniform(0.1, 1.0, len(keyframes)),
+            np.full(len(keyframes), POINT),
+            np.zeros((len(keyframes), 3)),
             none.turns,
         )
         eta = self._tangents(0.1 * rng.normal(size=(POSES + 1, d)))

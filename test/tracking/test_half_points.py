@@ -18,6 +18,8 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
+from slam_observer_ros.filter import core
+from slam_observer_ros.filter import step as numpy_step
 from slam_observer_ros.filter.robust import straight_odds, straight_share
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
@@ -25,6 +27,7 @@ from slam_observer_ros.models.motion_noise import MotionFactors
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.runs.health import of_estimate
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.smoothing import bordered_chain, gauss_newton
 
 STEP_NS, N = 100_000_000, 8
 SETTINGS = Settings(
@@ -56,6 +59,7 @@ class World:
         climb = 0.0 if settings.two_d_mode else 0.1
         self.V = np.array([0.0, climb, turn, 1.0, 0.0, climb])
         self.A, self.stamp_ns, self.errors = np.eye(4), 0, []
+        self.track = {}  # true and estimated poses by stamps
 
     def drive(self, seconds, kinds, rows=(0, 1, 2, 3)):
         """Drive on; at each step landmarks ``rows`` are seen, each by all ``kinds`` in turn."""
@@ -67,6 +71,7 @@ class World:
             if step % 4 == 0:
                 for event in self.seen(np.array(rows), kinds):
                     self.estimator.add(event)
+                self.track[self.stamp_ns] = self.A, self.estimator.pose
                 error = se3.inverse(self.A) @ self.estimator.pose
                 self.errors.append(np.linalg.norm(error[:3, 3]))
         self.estimator.flush()
@@ -265,3 +270,47 @@ def test_a_straight_way_leaves_the_side_open_and_says_to_drive_a_curve():
     entered = world.estimator.landmark_ids.tolist()
     assert entered
     assert not set(entered) & set(world.estimator.open_sides)
+
+
+@pytest.mark.parametrize('settings', [SETTINGS, SPATIAL], ids=['plane', 'space'])
+@pytest.mark.parametrize('known', [True, False], ids=['surveyed', 'unknown'])
+def test_numpy_does_with_half_points_what_the_compiled_core_does(settings, known, monkeypatch):
+    settings = replace(settings, range_scale_stddev=0.05)
+    worlds = []
+    for is_compiled in (True, False):
+        if not is_compiled:
+            for module in (core, bordered_chain, gauss_newton):
+                monkeypatch.setattr(module, 'COMPILED', None)
+            monkeypatch.setattr(core, 'advance', numpy_step.advance)
+            monkeypatch.setattr(core, 'observe', numpy_step.observe)
+        worlds.append(World(settings, known=known))
+        worlds[-1].drive(0.8 if known else 60.0, [RANGE, BEARING], rows=range(N))
+    poses = [world.estimator.pose for world in worlds]
+    assert set(worlds[0].estimator.landmark_ids) == set(range(N))
+    # What is not measured may be off by a kilometre, whose rounding adds up with the steps.
+    assert np.abs(poses[0] - poses[1]).max() < (1e-9 if known else 1e-7)
+
+
+@pytest.mark.parametrize('kind', [RANGE, BEARING])
+def test_smoothing_uses_views_from_before_a_landmark_entered(kind):
+    of_smoothed, of_filter = [], []
+    for seed in range(3):
+        world = World(SETTINGS, seed=seed, known=False)
+        while not len(world.estimator.landmark_ids):
+            world.drive(0.4, [kind], rows=range(N))
+        then_ns = world.stamp_ns
+        world.drive(60.0, [kind], rows=range(N))
+        smoothed = world.estimator.smooth()
+        for stamp_ns, again in zip(smoothed.stamps_ns.tolist(), smoothed.poses, strict=True):
+            A, pose = world.track[stamp_ns]
+            true = measured(world.points[smoothed.ids], A, kind)
+            for P, off in ((again, of_smoothed), (pose, of_filter)) if stamp_ns < then_ns else ():
+                off.append(measured(smoothed.world_points, P, kind) - true)
+    assert np.std(np.concatenate(of_smoothed)) < 0.7 * np.std(np.concatenate(of_filter))
+
+
+def measured(points, pose, kind):
+    """Return how far points are from a pose, or their directions."""
+    lines = se3.transform(se3.inverse(pose), points)
+    ranges = np.linalg.norm(lines, axis=1, keepdims=True)
+    return ranges if kind == RANGE else lines / ranges
