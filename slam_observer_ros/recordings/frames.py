@@ -31,7 +31,7 @@ from slam_observer_ros.messages.clouds import is_measured
 from slam_observer_ros.messages.detections import Camera
 from slam_observer_ros.messages.poses import pose_stack, PoseMessage
 from slam_observer_ros.settings.node_settings import InputSettings
-from slam_observer_ros.settings.parameter_table import check_angles, Pose6
+from slam_observer_ros.settings.parameter_table import checked
 
 logger = logging.getLogger(__name__)
 
@@ -234,14 +234,15 @@ class BaseFrame:
     """
 
     def __init__(self, settings: InputSettings, transforms: TransformBuffer) -> None:
-        settings = settings.with_plain_frames()
+        settings = checked(settings).with_plain_frames()
         self._transforms = transforms
         self.name = settings.base_frame
         self._map_frame = settings.map_frame
         self._world_frames = {self._map_frame, settings.odom_frame} - {''}
         self._sensor_frame = settings.sensor_frame
         self._tag_frame_prefix = settings.tag_frame_prefix
-        self._sensor_pose = _sensor_pose(settings.sensor_pose)
+        pose = settings.sensor_pose  # all zeros: from /tf
+        self._sensor_pose = se3.from_rpy(pose) if any(pose) else None
         self._is_rectified = settings.image_is_rectified
         self._without_poses: set[str] = set()  # frames of cameras whose tags /tf does not have
 
@@ -378,9 +379,3 @@ class BaseFrame:
             return self._transforms.lookup_child(camera, frame, stamp_ns)
         except TransformError as error:
             raise TransformError(f'{reason}; {error}') from error
-
-
-def _sensor_pose(values: Pose6) -> FloatArray | None:
-    """Return the sensor's pose (4, 4) of the settings; None if they give none."""
-    check_angles('sensor_pose', values)
-    return se3.from_rpy(values) if any(values) else None

@@ -123,7 +123,14 @@ class Parameter:
     def _vector(self, value: object, length: int) -> tuple[float, ...]:
         entries = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
         self._expect(value, len(entries) == length, f'a list of {length} numbers')
-        return tuple(self._in_range(self._number(entry)) for entry in entries)
+        vector = tuple(self._in_range(self._number(entry)) for entry in entries)
+        is_pose = length == len(('x', 'y', 'z', 'roll', 'pitch', 'yaw'))
+        if is_pose and max(map(abs, vector[3:])) > 2.0 * math.pi:
+            raise ParameterError(
+                f"parameter '{self.name}': roll, pitch and yaw are radians, which "
+                f'{list(vector[3:])} are not'
+            )
+        return vector
 
 
 def parameter(
@@ -184,15 +191,6 @@ def checked(settings: SettingsT) -> SettingsT:
     if not dataclasses.is_dataclass(settings):
         raise ParameterError(f'settings are wanted, not a {type(settings).__name__}')
     return from_parameters(type(settings), dataclasses.asdict(settings))
-
-
-def check_angles(name: str, pose: Pose6) -> None:
-    """Raise a ParameterError if a pose's angles are beyond 2π, as those in degrees are."""
-    angles_rad = list(pose[3:])
-    if max(map(abs, angles_rad)) > 2.0 * math.pi:
-        raise ParameterError(
-            f"parameter '{name}': roll, pitch and yaw are radians, which {angles_rad} are not"
-        )
 
 
 def changed_names(settings: Dataclass) -> list[str]:

@@ -15,6 +15,7 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import (
+    InputSettings,
     ManagedNodeSettings,
     ObserverNodeSettings,
     SimulatorNodeSettings,
@@ -195,8 +196,18 @@ def values_of(row):
         return st.integers(int(low), int(high))
     number = st.floats(low, high) | st.sampled_from([low, high])
     if isinstance(row.default, tuple):
+        if len(row.default) == 6:  # a pose, whose angles are no degrees
+            angle = st.floats(-2.0 * math.pi, 2.0 * math.pi)
+            return st.tuples(*[number] * 3, *[angle] * 3)
         return st.lists(number, min_size=len(row.default), max_size=len(row.default))
     return number
+
+
+@pytest.mark.parametrize('name', ['sensor_pose', 'initial_pose'])
+def test_angles_of_a_pose_in_degrees_are_refused(name):
+    kind = Settings if name == 'initial_pose' else InputSettings
+    with pytest.raises(ParameterError, match=f"'{name}': roll, pitch and yaw are radians"):
+        from_parameters(kind, {name: [0.0, 0.0, 0.0, 0.0, 0.0, 90.0]})
 
 
 @pytest.mark.parametrize('row', table(Settings), ids=lambda row: row.name)
