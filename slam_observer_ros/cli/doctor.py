@@ -39,7 +39,7 @@ from slam_observer_ros.messages.detections import APRILTAGS
 from slam_observer_ros.messages.poses import TRANSFORMS
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.runs.health import of_half_points
-from slam_observer_ros.runs.mistakes import mistakes
+from slam_observer_ros.runs.mistakes import is_flat, mistakes
 from slam_observer_ros.runs.run_health import of_publishers
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import message_types
@@ -184,9 +184,6 @@ def _topics(seconds: float) -> list[dict[str, Any]]:
 MOST_EVENTS = 60_000
 """Events of a recording that are looked at, from its start."""
 
-OUT_OF_PLANE = 0.1
-"""Share of turning or of speed beyond which a robot is not on a floor."""
-
 REPEATED = 0.5
 """Share of the velocities that are exactly the one before beyond which they are commands."""
 
@@ -234,7 +231,7 @@ def fitting_file(kind: str, events: Sequence[Event]) -> tuple[str, str]:
         [event.body_velocity for event in events if isinstance(event, VelocityEvent)]
     ).reshape(-1, 6)
     seen = [e for e in events if isinstance(e, ObservationEvent) and len(e.ids)]
-    flat = _is_flat(velocities)
+    flat = is_flat(velocities)
     where = 'the robot stays on a floor' if flat else 'it tilts or climbs: two_d_mode: false'
     kinds = {half for e in seen for half in (e.kinds.tolist() if e.kinds is not None else [POINT])}
     if kinds and POINT not in kinds:
@@ -278,14 +275,6 @@ def _are_reflectors(seen: list[ObservationEvent]) -> bool:
     ranges_m = np.concatenate([np.linalg.norm(e.lines_of_sight, axis=1) for e in seen])
     are_few = np.median([len(e.ids) for e in seen]) <= FEW
     return bool(are_few and np.mean(ranges_m > FAR_M) > FAR_SHARE)
-
-
-def _is_flat(velocities: FloatArray) -> bool:
-    """Return whether hardly any of the motion is out of the plane z = 0."""
-    squares = (velocities**2).sum(axis=0)
-    tilting, climbing = squares[:2].sum(), squares[5]
-    limit = OUT_OF_PLANE**2
-    return bool(tilting <= limit * squares[:3].sum() and climbing <= limit * squares[3:].sum())
 
 
 def _are_commands(velocities: FloatArray) -> bool:

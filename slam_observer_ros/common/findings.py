@@ -747,8 +747,8 @@ _OF_POSE = frozenset({
 SYMPTOMS = OF_ODOMETRY | _OF_POSE | {
     'rejected_points', 'left_out_points', 'unmapped_points', 'drive_a_curve', 'wrong_pose',
     'not_relinearised', 'slip', 'unexpected_place', 'moved_landmark', 'many_moved',
-    'carried_landmark', 'mounting', 'range_scale', 'depth_for_range', 'point_noise',
-    'large_noise', 'overconfident_pose', 'error_growth',
+    'carried_landmark', 'id_at_two_places', 'mounting', 'range_scale', 'depth_for_range',
+    'point_noise', 'large_noise', 'overconfident_pose', 'error_growth',
 }  # fmt: skip
 """Findings that a mistake of the set-up may cause, and whose remedies would then be untrue."""
 

@@ -236,6 +236,18 @@ class Drive:
         self._last = event
 
 
+OUT_OF_PLANE = 0.1
+"""Share of turning or of speed beyond which a robot is not on a floor."""
+
+
+def is_flat(velocities: FloatArray) -> bool:
+    """Return whether hardly any of the motion (k, 6) is out of the plane z = 0."""
+    squares = np.square(velocities).sum(axis=0)
+    tilting, climbing = squares[:2].sum(), squares[5]
+    limit = OUT_OF_PLANE**2
+    return bool(tilting <= limit * squares[:3].sum() and climbing <= limit * squares[3:].sum())
+
+
 def never_turns(events: Iterable[Event]) -> bool:
     """Return whether the robot drives, and all its angular velocities are exactly zero."""
     moves = [each.body_velocity for each in events if isinstance(each, VelocityEvent)]
@@ -368,9 +380,14 @@ def _best(
     """
     early, tried = first_drive(events, EARLY), []
     at_first = before.until(early[-1].stamp_ns)
-    is_in_degrees = Drive(events).turned_rad * IN_DEGREES > LEAST_TURN_RAD
+    moves = [each.body_velocity for each in events if isinstance(each, VelocityEvent)]
+    may_be = {
+        'turning_in_degrees': Drive(events).turned_rad * IN_DEGREES > LEAST_TURN_RAD,
+        # In the plane ways that go out of it are too long for what is seen.
+        'tag_size': is_flat(np.reshape(moves, (-1, 6))) or not settings.two_d_mode,
+    }
     for each in corrections:
-        if each.kind != 'turning_in_degrees' or is_in_degrees:
+        if may_be.get(each.kind, True):
             score = yield from _score(settings, early, each, known)
             if not at_first.is_clearly_better(score):
                 tried.append(score)

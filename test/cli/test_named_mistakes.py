@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 import json
+from pathlib import Path
 
 from mistaken_drives import drive, MADE, SETTINGS, surveyed
 import pytest
@@ -49,6 +50,13 @@ def test_where_all_is_right_none_is_named(tmp_path, capsys, known):
     for arguments in (['replay', path, *OPTIONS], ['doctor', path, '--load-map', known]):
         assert main([*arguments, '--json']) == 0
         assert not kinds(capsys.readouterr().out) & MISTAKES
+
+
+def test_where_a_parameter_file_does_not_fit_no_size_is_named(capsys):
+    """As of a robot that tilts, whose ways are longer than what is seen of them in the plane."""
+    sample = str(Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap')
+    assert main(['replay', sample, '--config', 'wheeled_bearing_range', '--json']) == 0
+    assert not kinds(capsys.readouterr().out) & MISTAKES
 
 
 def test_that_no_pose_was_found_in_a_map_does_not_hide_it(tmp_path, capsys, known):
