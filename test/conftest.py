@@ -61,22 +61,22 @@ settings.load_profile('suite')
 
 
 LONGEST = (
+    'test_mistakes',
     'test_real_recordings',
-    'test_ament_style',
-    'test_batch',
-    'test_live_settings',
     'test_association',
-    'test_slip',
-    'test_calibration',
-    'test_large_maps',
-    'test_batch_cluster',
+    'test_named_mistakes',
     'test_map_replay',
-    'test_cli_replay',
-    'test_replay_outputs',
     'test_report',
-    'test_figures',
-    'test_smoothing',
-    'test_given_poses',
+    'test_slip',
+    'test_live_settings',
+    'test_batch_cluster',
+    'test_found_without_ids',
+    'test_ament_style',
+    'test_cli_simulate',
+    'test_noise_search',
+    'test_replay_inputs',
+    'test_batch',
+    'test_cli_usage',
 )
 """Files that take longest, of those without nodes: they begin early, so that none ends alone."""
 

@@ -8,7 +8,7 @@ from mapped_worlds import add, MODES, World
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
@@ -216,7 +216,7 @@ class TestInitialPoseOfTheSettings:
         for event in world.drive(0.0, 5.0):
             is_seen = isinstance(event, ObservationEvent)
             estimator.add(replace(event, ids=np.full(6, UNKNOWN_ID)) if is_seen else event)
-        assert world.nees(estimator, 4.9) < chi2.ppf(0.9973, 3)
+        assert world.nees(estimator, 4.9) < chdtri(3, 0.0027)
         assert np.linalg.norm(world.error(estimator, 4.9)[3:]) < 0.1
 
     def test_without_a_map_it_is_exact(self):
