@@ -433,8 +433,7 @@ KINDS = {
     ),
     'contradicted_pose': Kind(
         Level.ERROR,
-        'the pose in the map is wrong, or the landmarks in view were moved: all of them are '
-        'rejected',
+        'the pose in the map is wrong, or the landmarks in view were moved: they contradict it',
         'drive to where more of the map is in view, or give the pose (on initialpose)',
     ),
     'diverged': Kind(

@@ -381,6 +381,7 @@ class Estimator(Estimate):
                 known = loaded.ids, loaded.covariances
                 if self._hypotheses.follow_drift(event, update, *known):
                     self._timeline.velocities.doubt_standing()
+                    self._localiser.doubt_strayed(self._state, update)
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
             is_alone = len(self._hypotheses) == 1

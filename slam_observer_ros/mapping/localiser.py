@@ -66,6 +66,10 @@ By then it is no garbled message any more: behaviour trees ask within a second.
 """
 
 
+STRAYED_NS = 2_000_000_000
+"""For how long a pose is doubted that landmarks contradict which are too few to find it."""
+
+
 class Localiser:
     """Follows whether the estimate is in the frame of a map that was loaded."""
 
@@ -131,8 +135,14 @@ class Localiser:
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether all that is seen of a map that does not change contradicts the pose."""
-        return self._contradiction.lasts
+        """Whether what is seen of a map contradicts the pose, at once or view by view."""
+        return self._contradiction.lasts or self._contradiction.is_doubted
+
+    def doubt_strayed(self, state: State, update: Update) -> None:
+        """Doubt a pose which the last views contradict together, if they do not find it either."""
+        if len(update.ids) < state.axes.point:
+            self.counts['contradicted_pose'] += not self.is_contradicted
+            self._contradiction.doubted_until_ns = update.stamp_ns + STRAYED_NS
 
     def may_be_rough(self, event: ObservationEvent) -> bool:
         """Return whether points without ids are to be matched by a pose just given."""
@@ -176,6 +186,8 @@ class Localiser:
         """Return whether enough of a map that does not change says so, one after the other."""
         if not self.is_localised or state.is_mapping:
             return False
+        if np.count_nonzero(~update.rejected) >= state.axes.point:
+            self._contradiction.doubted_until_ns = 0
         if self._contradiction.begins(update):
             self.counts['contradicted_pose'] += 1
             logger.warning('%s', found('contradicted_pose'))
@@ -399,7 +411,12 @@ class Contradiction:
     def __init__(self) -> None:
         self._moved: set[int] = set()
         self._rejected: set[int] = set()  # since any was accepted
-        self._times = self._since_ns = self._last_ns = 0
+        self._times = self._since_ns = self._last_ns = self.doubted_until_ns = 0
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether it was contradicted by few landmarks lately, and nothing has confirmed it."""
+        return 0 < self.doubted_until_ns - self._last_ns <= STRAYED_NS
 
     @property
     def lasts(self) -> bool:

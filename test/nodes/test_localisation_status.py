@@ -65,8 +65,8 @@ class Watched:
         (
             {'is_contradicted': True},
             ERROR,
-            'the pose in the map is wrong, or the landmarks in view were moved: all of them are '
-            'rejected',
+            'the pose in the map is wrong, or the landmarks in view were moved: they '
+            'contradict it',
             False,
         ),
         (
