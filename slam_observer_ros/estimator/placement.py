@@ -18,6 +18,7 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.localiser import is_rough, Localiser
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
+from slam_observer_ros.tracking.half_points import take_scales
 from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.waiting_room import Window
@@ -126,7 +127,9 @@ class Placement:
             self.start(by_tag.pose, by_tag.covariance, by_tag.known)
             localiser.try_tag(by_tag.tag_id)
         elif (fix := localiser.pose_by_half_points(hypotheses.best, window)) is not None:
-            self.start(*fix)
+            lost = hypotheses.best
+            self.start(fix.pose, fix.covariance, fix.known)
+            take_scales(hypotheses.best, lost, fix.scales)
 
     def start(
         self,

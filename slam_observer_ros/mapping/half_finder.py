@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,6 +75,7 @@ class Views:
     variances: FloatArray  # (n, 2) of ranges, m², and of directions, rad²
     walks: FloatArray  # (n, 6, 6) covariance of the way until now, in the body's axes now
     sensors: IntArray  # (n,) which sensor each is of: each has a scale of its own
+    frames: tuple[str, ...]  # of the sensors
 
     def mirrored(self) -> Views:
         """Return the views as from a way that turned to the other side."""
@@ -106,6 +108,15 @@ class Fit:
         return float(off @ np.linalg.solve(P, off)) < SAME**2
 
 
+class Fix(NamedTuple):
+    """Where a robot is that was lost."""
+
+    pose: FloatArray  # (4, 4) in the map
+    covariance: FloatArray  # (6, 6) of rotation vector and position, map axes
+    known: LandmarkMap
+    scales: dict[str, float]  # ln of how much longer ranges are than as calibrated, by sensor
+
+
 class HalfFinder:
     """Searches maps for the pose of a robot by its window of views.
 
@@ -119,10 +130,8 @@ class HalfFinder:
         self.rivals: list[FloatArray] = []
         self.in_a_line: list[int] = []
 
-    def find(
-        self, state: State, window: Window
-    ) -> tuple[FloatArray, FloatArray, LandmarkMap] | None:
-        """Return pose (4, 4), covariance (6, 6) and map; None unless one pose alone fits.
+    def find(self, state: State, window: Window) -> Fix | None:
+        """Return where the robot is; None unless one pose alone fits.
 
         Also if not much is new since the last search.
         """
@@ -150,7 +159,8 @@ class HalfFinder:
         elif len(alike) > 1:
             self.rivals = alike
         elif _is_sure(best, views, axes):
-            return best.pose, best.covariance, known
+            scales = dict(zip(views.frames, best.scales.tolist(), strict=True))
+            return Fix(best.pose, best.covariance, known, scales)
         return None
 
 
@@ -226,6 +236,7 @@ def _views(window: Window, state: State, known: LandmarkMap) -> Views | None:
         variances=variances[:, :2],
         walks=Ad @ walks @ Ad.T,
         sensors=np.array([sensors.index(view.sensor_frame) for view in views]),
+        frames=tuple(sensors),
     )
 
 

@@ -28,7 +28,7 @@ from slam_observer_ros.tracking.waiting_room import Window
 
 if TYPE_CHECKING:
     from slam_observer_ros.mapping.finder import Finder
-    from slam_observer_ros.mapping.half_finder import HalfFinder
+    from slam_observer_ros.mapping.half_finder import Fix, HalfFinder
     from slam_observer_ros.mapping.places import Place
 
 logger = logging.getLogger(__name__)
@@ -216,10 +216,8 @@ class Localiser:
         self._tag = tag_id
         logger.info('Found the pose in the map by tag %d.', tag_id)
 
-    def pose_by_half_points(
-        self, state: State, window: Window
-    ) -> tuple[FloatArray, FloatArray, LandmarkMap] | None:
-        """Return pose (4, 4), covariance (6, 6) and map by the views of ranges or bearings alone.
+    def pose_by_half_points(self, state: State, window: Window) -> Fix | None:
+        """Return where the robot is by the views of ranges or bearings alone.
 
         None while the pose in the map is known, or they fit no place or several.
         """

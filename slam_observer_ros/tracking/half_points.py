@@ -29,6 +29,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.filter.robust import straight_odds, straight_share
 from slam_observer_ros.lie.matrices import diagonal_blocks
 from slam_observer_ros.lie.sensor_mounting import completed_lines, directions_of, MEASURED
+from slam_observer_ros.models.calibration import SCALE
 from slam_observer_ros.models.observation_noise import point_covariances
 from slam_observer_ros.tracking.matching import calibrated, residuals_of
 from slam_observer_ros.tracking.state import State
@@ -284,6 +285,25 @@ def _with_sensor(state: State, event: ObservationEvent) -> ObservationEvent:
     if calibration.corrects_points and event.sensor_frame not in calibration.sensors:
         state.add_sensor(event.sensor_frame)
     return event
+
+
+def take_scales(state: State, lost: State, scales: Mapping[str, float]) -> None:
+    """Begin with ranges by what a search has found, beyond how a ``lost`` state has them.
+
+    ``scales`` are ln of how much longer, by sensor. That is a better value, of errors as stated.
+    """
+    calibration = state.calibration
+    if SCALE not in calibration.of_sensor:
+        return
+    for frame, scale in scales.items():
+        state.gains.add_sensor(frame)
+        change = np.zeros(calibration.count)
+        now = math.log(sensor_values(lost, frame)[2]) + scale
+        change[calibration.columns(frame)] = np.where(
+            calibration.of_sensor == SCALE, now - calibration.sensor(frame)[SCALE], 0.0
+        )
+        calibration.shift(change)
+        state.relinearisation.add_calibration()
 
 
 def _completed(

@@ -314,3 +314,15 @@ def measured(points, pose, kind):
     lines = se3.transform(se3.inverse(pose), points)
     ranges = np.linalg.norm(lines, axis=1, keepdims=True)
     return ranges if kind == RANGE else lines / ranges
+
+
+def test_a_lost_robot_that_is_found_has_the_scale_of_its_ranges_from_the_search():
+    world = World(replace(SETTINGS, range_scale_stddev=0.1), scale=1.07)
+    survey = world.estimator.loaded_maps[0]
+    world.estimator = Estimator(world.settings)
+    world.estimator.load_map(survey)
+    while not world.estimator.is_localised:
+        world.drive(0.4, [RANGE], rows=range(N))
+        assert world.stamp_ns < 60e9
+    (scale,) = (e for e in world.estimator.calibration if e.name == 'range_scale')
+    assert scale.value == pytest.approx(1.07, abs=0.02)
