@@ -92,7 +92,8 @@ class Finder:
         self._ids = np.concatenate([known.ids for known in maps])
         self._has_warned = False  # of maps that look alike, to points without ids
         self.alike = AlikeMaps([], _likeness)
-        self._searched: dict[str, tuple[int, int]] = {}
+        self._searched: tuple[int, int] | None = None
+        self._compared = 0  # bits of the number of views at which ids were compared last
         self.contradiction: Finding | None = None  # of ids and places, as it was seen last
         self.places: Places | None = None  # that fit, when it was searched last
 
@@ -101,7 +102,7 @@ class Finder:
 
         None unless there is one place that fits, or if nothing much is new since the last search.
         """
-        if not (rows := self._rows(state)).size or not self._is_due(state, rows, 'sought'):
+        if not (rows := self._rows(state)).size or not self._is_due(state, rows):
             return None
         P = state.gains.joint_covariance(rows)
         if P is None:
@@ -121,8 +122,10 @@ class Finder:
         """See whether a map has the ids but other places, or the places but other ids."""
         landmarks, fewest = state.landmarks, FEWEST_COMPARED + state.axes.point
         rows = np.flatnonzero(~is_automatic(landmarks.ids) & (landmarks.counts >= MIN_COUNT))
-        if len(rows) < fewest or not self._is_due(state, rows, 'compared'):
+        views = int(landmarks.counts[rows].sum()).bit_length()
+        if len(rows) < fewest or views == self._compared:
             return
+        self._compared = views
         P = state.gains.joint_covariance(rows)
         if P is None:
             return
@@ -170,12 +173,12 @@ class Finder:
             return np.empty(0, dtype=np.int64)
         return rows[np.argsort(-landmarks.last_seen_ns[rows], kind='stable')][:MAX_WEIGHED]
 
-    def _is_due(self, state: State, rows: IntArray, purpose: str) -> bool:
-        """Return whether a search may say more than the last one for that purpose."""
+    def _is_due(self, state: State, rows: IntArray) -> bool:
+        """Return whether a search may say more than the last one."""
         seen_so_often = math.log(float(state.landmarks.counts[rows].sum()))
         news = (len(rows), int(seen_so_often / math.log(NEWS)))
-        is_due = news != self._searched.get(purpose)
-        self._searched[purpose] = news
+        is_due = news != self._searched
+        self._searched = news
         return is_due
 
     def _search(self, seen: Constellation, ids: IntArray) -> Places:
