@@ -21,7 +21,7 @@ from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import table
 
 IMPERATIVES = re.compile(
-    r'(add|check|do|drive|give|is|keep|let|look|mind|move|only|record|remap|resume|see|send|set|'
+    r'(add|check|do|drive|give|is|keep|let|load|look|mind|move|only|record|remap|resume|see|send|set|'
     r'state|survey|synchronise|take|to keep|try|use|has|are|did|if|some|max_landmarks|where)\b'
 )
 """How a remedy begins: it says what to do, or asks what to look at."""
