@@ -79,7 +79,7 @@ class Change(_Counted):
     MOVED = 'moved_landmark', 'moved: it is where it was seen now'
     MERGED = 'merged_landmark', 'merged with another landmark, which it is'
     FORGOTTEN = 'forgotten_landmark', 'forgotten to make room (max_landmarks)'
-    UNSUPPORTED = 'unsupported_landmark', 'forgotten: seen too seldom while in view'
+    UNSUPPORTED = 'unsupported_landmark', 'forgotten: hardly exists, by what was seen and missed'
     CARRIED = 'carried_landmark', 'moves with the robot'
 
 

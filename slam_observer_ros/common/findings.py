@@ -424,9 +424,9 @@ KINDS = {
     ),
     'unconfirmed_map': Kind(
         Level.WARNING,
-        '{waiting} landmarks without ids were seen fewer than {times} times (min_support), and '
-        'only {known} are in the map',
-        'drive more slowly, see them more often, or set min_support lower if few points are false',
+        '{waiting} landmarks without ids were seen too seldom to be sure that they exist, and only '
+        '{known} are in the map',
+        'drive more slowly, or see them more often',
     ),
     'wrong_pose': Kind(
         Level.WARNING, 'the pose in the map is wrong: {reason}; localising again', GIVE_THE_POSE

@@ -97,7 +97,7 @@ class Estimate:
 
     @property
     def waiting_landmarks(self) -> int:
-        """How many landmarks without an id are yet to be seen often enough to be in the map."""
+        """How many landmarks without an id are not in the map, as they may not exist."""
         return int(np.count_nonzero(self._state.landmarks.tentative))
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -15,14 +16,24 @@ from slam_observer_ros.common.types import (
     LandmarkColumns,
 )
 
-PATIENCE = 4
-"""A landmark has had its chance when others in view as often were seen so many times as often.
-
-Some are seen more seldom than others: from afar, or from one side only.
+REAL, FALSE = 1.0, 0.05
+"""Landmarks without ids that existed, and false points, as if seen before the first: one in twenty
+points is false where nothing is known yet.
 """
 
-TOO_SELDOM = 5
-"""How many times more seldom than others a landmark may be seen that was confirmed once."""
+ERROR = 0.01
+"""Probability that a landmark of the map does not exist, and that one which is forgotten does."""
+
+SURE = math.log(1.0 / ERROR - 1.0)
+"""Log odds from which on a landmark exists."""
+
+MOST_EVIDENCE = 3.0 * SURE
+"""Most evidence for a landmark without an id: what has vanished must not stay for ever."""
+
+TOO_SELDOM, LEAST_COUNT = 5, 4
+"""How many times more seldom than others a landmark may be seen that is passed by, and how often
+it counts as seen at least: few misses may be chance.
+"""
 
 MIN_SHARE, MOST_SHARE = 0.1, 0.9
 """Least and greatest share of observations in which a landmark in view is seen: of a loaded map
@@ -54,7 +65,7 @@ class LandmarkTable(LandmarkColumns):
             ),
             (np.int64, ()),
         ),
-        'tentative': (np.bool_, ()),
+        'evidence': (np.float64, ()),
         'rejected_at': (np.float64, (3,)),
         'rejected_last': (np.float64, (3,)),
     }
@@ -64,7 +75,9 @@ class LandmarkTable(LandmarkColumns):
     # (n,) stamps of the latest observation and the one before it; −1 for none in this run
     last_seen_ns: IntArray
     seen_before_ns: IntArray
-    tentative: BoolArray  # (n,) which have no id, and have yet to be seen often enough to stay
+    # (n,) log of how much likelier each makes what was seen of it than if it were a false point;
+    # infinite where an id or a map says that it exists
+    evidence: FloatArray
     # (n,) observations without ids that had it in view, and how many since it was seen
     in_view: IntArray
     missed: IntArray
@@ -79,9 +92,11 @@ class LandmarkTable(LandmarkColumns):
 
     def __init__(self) -> None:
         super().__init__()
-        # how often those without ids that were confirmed were in view, and were seen
+        # how often those without ids that surely exist were in view, and were seen
         self._confirmed_in_view = 0
         self._confirmed_seen = 0
+        self._false = FALSE  # points that were taken for landmarks
+        self.prior = math.log(REAL / FALSE)  # log odds that a landmark just seen exists
         self._sort()
 
     def rows_of(self, ids: IntArray) -> IntArray:
@@ -105,7 +120,7 @@ class LandmarkTable(LandmarkColumns):
         n = len(self) - len(ids)
         self.add(ids, -1)
         self.counts[n:] = counts
-        self.tentative[n:] = False
+        self.evidence[n:] = np.inf
 
     def clear_time(self) -> None:
         """Take all landmarks as last seen before any stamp to come."""
@@ -114,7 +129,7 @@ class LandmarkTable(LandmarkColumns):
     def renumber(self, rows: IntArray, ids: IntArray) -> None:
         """Give ``rows`` (m,) other ids (m,)."""
         self.ids[rows] = ids
-        self.tentative[rows] &= is_automatic(ids)
+        self.evidence[rows[~is_automatic(ids)]] = np.inf
         self._sort()
 
     def accept(self, rows: IntArray, stamp_ns: int) -> None:
@@ -218,25 +233,49 @@ class LandmarkTable(LandmarkColumns):
         """:attr:`seen_share` within likely limits."""
         return min(max(self.seen_share, MIN_SHARE), MOST_SHARE)
 
-    def unsupported(self, min_support: int) -> IntArray:
-        """Return rows without an id that were seen too seldom to be landmarks.
+    @property
+    def tentative(self) -> BoolArray:
+        """Which landmarks (n,) may not exist."""
+        return np.asarray(self.evidence + self.prior < SURE)
 
-        That is less than ``min_support`` times by when a confirmed one, as often in view, would
-        have been seen :data:`PATIENCE` times as often. One that was seen so often is confirmed
-        here. It stays unless it is passed by so often that it is seen :data:`TOO_SELDOM` times
-        more seldom than others; one that a map had stays in any case.
+    def existence(self, rows: IntArray) -> FloatArray:
+        """Return the probability that ``rows`` (m,) exist, by all that was seen of them."""
+        return np.asarray(1.0 / (1.0 + np.exp(-self.evidence[rows] - self.prior)))
+
+    def weigh(self, rows: IntArray, evidence: FloatArray) -> int:
+        """Count evidence (m,) that ``rows`` exist; return how many surely do since then."""
+        before, after = self.evidence[rows], self.evidence[rows] + evidence
+        self.evidence[rows] = np.where(before < np.inf, np.minimum(after, MOST_EVIDENCE), before)
+        now = rows[(before + self.prior < SURE) & (after + self.prior >= SURE)]
+        self._confirmed_in_view += int(np.sum(self.in_view[now]))
+        self._confirmed_seen += int(np.sum(self.counts[now]))
+        return len(now)
+
+    def hidden(self, rows: IntArray) -> FloatArray:
+        """Return the probability that existing ``rows`` (m,), in view, are missed once more.
+
+        The rate at which one in view is seen differs between landmarks and poses. Where it is
+        exponentially distributed about its mean p, one is missed k times in a row with the
+        probability 1/(1 + k p): one that is hidden soon says little more.
         """
-        confirmed_now = self.tentative & (self.counts >= min_support)
-        self._confirmed_in_view += int(np.sum(self.in_view[confirmed_now]))
-        self._confirmed_seen += int(np.sum(self.counts[confirmed_now]))
-        self.tentative &= ~confirmed_now
-        # Before any is confirmed nobody knows how often one is seen.
-        expected = self.in_view * self.seen_share
-        had_its_chance = self.tentative & (expected >= PATIENCE * min_support)
+        p, missed = self.likely_share, self.missed[rows]
+        return np.asarray((1.0 + missed * p) / (1.0 + (missed + 1.0) * p))
+
+    def unlikely(self) -> IntArray:
+        """Return rows without an id that hardly exist, or no more; learn how many are false.
+
+        One that surely existed goes if it is passed by so often that it is seen
+        :data:`TOO_SELDOM` times more seldom than others; one that a map had stays in any case.
+        """
+        own = is_automatic(self.ids) & (self.born_ns >= 0)
+        exist = float(self.existence(np.flatnonzero(own)).sum())
+        false = float(np.count_nonzero(own)) - exist + self._false
+        self.prior = math.log((exist + REAL) / max(false, FALSE))
+        is_false = own & (self.evidence + self.prior < -SURE)
+        self._false += float(np.count_nonzero(is_false))
         expected = self.passed * self.seen_share
-        has_gone = is_automatic(self.ids) & (self.born_ns >= 0)
-        has_gone &= expected >= np.maximum(TOO_SELDOM * self.counts, PATIENCE * min_support)
-        return np.flatnonzero(had_its_chance | has_gone)
+        has_gone = own & (expected >= TOO_SELDOM * np.maximum(self.counts, LEAST_COUNT))
+        return np.flatnonzero(is_false | has_gone)
 
     def unseen_since(self, stamp_ns: int) -> IntArray:
         """Return rows not seen since a stamp: least often seen first, then longest ago."""
@@ -249,7 +288,7 @@ class LandmarkTable(LandmarkColumns):
         self.seen_before_ns[rows] = -1
         self.counts[rows] = 1
         self.rejections[rows] = 0
-        self.tentative[rows] = is_automatic(self.ids[rows])
+        self.evidence[rows] = np.where(is_automatic(self.ids[rows]), 0.0, np.inf)
         self.in_view[rows] = self.passed[rows] = self.missed[rows] = 0
 
     def merge(self, rows: IntArray, copies: IntArray) -> None:
@@ -261,7 +300,7 @@ class LandmarkTable(LandmarkColumns):
         for column in (self.last_seen_ns, self.seen_before_ns, self.missed):
             column[later] = column[latest]
         self.rejections[rows] = 0
-        self.tentative[rows] &= self.tentative[copies]
+        self.evidence[rows] = np.maximum(self.evidence[rows], self.evidence[copies])
 
     def delete(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""

@@ -179,7 +179,7 @@ def _renumber(state: State, known: LandmarkMap, rows: IntArray, known_ids: IntAr
     taken = np.append(ids[is_automatic(ids)], known.ids[is_automatic(known.ids)])
     state.landmarks.renumber(own, np.max(taken, initial=0) + 1 + np.arange(len(own)))
     state.landmarks.renumber(rows, known_ids)
-    state.landmarks.tentative[rows] = False
+    state.landmarks.evidence[rows] = np.inf
 
 
 def _complete(state: State, known: LandmarkMap, added: LandmarkMap) -> None:

@@ -160,10 +160,9 @@ def of_map_without_ids(estimator: Estimate, ambiguity: Ambiguity | None) -> list
         lasts_s, probability = to_s(ambiguity.lasts_ns), ambiguity.probability
         findings.append(found('ambiguous_map', lasts_s=lasts_s, x=x, y=y, probability=probability))
     # After twice as many observations as one landmark takes.
-    times = estimator.settings.min_support
-    is_begun = estimator.counts['observation'] >= 2 * times
+    is_begun = estimator.counts['observation'] >= 2 * estimator.settings.confirmations
     if is_begun and known < HARDLY_ANY * waiting:
-        findings.append(found('unconfirmed_map', waiting=waiting, times=times, known=known))
+        findings.append(found('unconfirmed_map', waiting=waiting, known=known))
     return findings
 
 

@@ -422,17 +422,10 @@ class Settings:
         minimum=1,
         maximum=1_000_000,
     )
-    min_support: int = parameter(
-        5,
-        'Riccati, points without id: views after which a landmark is in the map; it is deleted'
-        " if four times a typical landmark's time in view did not suffice",
-        minimum=1,
-        maximum=1_000_000,
-    )
     max_hypotheses: int = parameter(
         8,
         'Riccati, points without id, or a robot that may have slipped: most hypotheses that '
-        'are followed; at most two where points have no id',
+        'are followed',
         minimum=1,
         maximum=1000,
     )

@@ -12,6 +12,7 @@ that landmark as well as the sensor measures it: a new id suggests a new landmar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_a
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.landmark_table import MIN_LOOP
 from slam_observer_ros.filter.observer import Observer, Residuals
-from slam_observer_ros.filter.robust import accepted
+from slam_observer_ros.filter.robust import accepted, huber_loss
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import SPATIAL
 from slam_observer_ros.lie.matrices import (
@@ -61,6 +62,7 @@ class Assignment:
     """What the points of an observation are taken for."""
 
     rows: IntArray  # (m,) row of the landmark that each point is, −1 for a new one
+    evidence: FloatArray  # (m,) that this landmark exists; 0 for a new one
     cost: float  # −2 ln of its likelihood; a part that all assignments share is left out
 
 
@@ -68,15 +70,15 @@ def find_assignments(
     state: State,
     index: LandmarkIndex,
     event: ObservationEvent,
-    new_cost: float,
+    new_costs: FloatArray,
     budget: float,
     is_alone: bool,
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different poses, the most likely first.
 
     ``state`` is at the instant of ``event``, an observation of m points, and ``index`` has
-    its landmarks. A point without an id costs ``new_cost`` if it is of a new landmark. None costs
-    more than ``budget``. Where the state ``is_alone``, costs matter only to each other.
+    its landmarks. Points without an id cost ``new_costs`` (m,) if they are of a new landmark. None
+    costs more than ``budget``. Where the state ``is_alone``, costs matter only to each other.
     """
     # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
     axes, m = state.axes, len(event.ids)
@@ -86,26 +88,38 @@ def find_assignments(
     r, noise = residuals.on(axes)
     # Which points are of a known landmark in any case: nearly always all, and each of one.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
+    gate_cost = unpaired_cost(state.settings.rejection_threshold)
+    none_costs = np.where(event.ids == UNKNOWN_ID, new_costs, gate_cost)
     if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at) == m:
-        return [Assignment(_taken(m, at, rows), 0.0)]
+        evidence = 0.5 * (none_costs[at] - huber_loss(mahalanobis(r, noise)))
+        return [Assignment(_taken(m, at, rows, -1), _taken(m, at, evidence, 0.0), 0.0)]
     PC, CPC = state.known_errors.predicted(residuals)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
     # The cost of a point that is of no landmark.
-    gate_cost = unpaired_cost(state.settings.rejection_threshold)
-    none_costs = np.where(event.ids == UNKNOWN_ID, new_cost, gate_cost)
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
     # Points outside the search; one of no landmark costs the same whatever it might have been.
     fixed_cost = float(none_costs.sum() - unpaired_costs[np.unique(at)].sum())
     margin = 0.0 if certain.all() else pruning_cost(event.ids)
-    search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
+    pair_costs = -2.0 * np.log(state.landmarks.existence(rows))
+    search = JointSearch(
+        pairs, certain, unpaired_costs[at], margin, budget - fixed_cost, pair_costs
+    )
     moves = _PoseMoves(state, seen, PC)
     # Nearly always each point may be of one landmark, and all together hardly move the robot.
     are_single = len(np.unique(at)) == len(np.unique(rows)) == len(at) > 0
     whole = search.all_pairs() if are_single else None
     is_enough = whole is not None and _largest(moves.by(whole)) <= HARDLY_MOVED
     pairings = [whole] if whole is not None and is_enough else moves.distinct(search.pairings())
+    # By how much likelier each pair is than a point of nothing known.
+    S = diagonal_blocks(CPC, axes.point) + noise
+    log_dets = np.linalg.slogdet(S)[1] - np.linalg.slogdet(noise)[1]
+    evidence = np.maximum(0.5 * (none_costs[at] - huber_loss(mahalanobis(r, S)) - log_dets), 0.0)
     return [
-        Assignment(_taken(m, at[each.chosen], rows[each.chosen]), each.cost + fixed_cost)
+        Assignment(
+            _taken(m, at[each.chosen], rows[each.chosen], -1),
+            _taken(m, at[each.chosen], evidence[each.chosen], 0.0),
+            each.cost + fixed_cost,
+        )
         for each in pairings
     ]
 
@@ -136,10 +150,10 @@ class _PoseMoves:
         return distinct
 
 
-def _taken(m: int, at: IntArray, rows: IntArray) -> IntArray:
-    """Return the landmark (m,) of each point, −1 but for the points ``at`` (q,)."""
-    taken = np.full(m, -1)
-    taken[at] = rows
+def _taken(m: int, at: IntArray, values: Any, other: float) -> Any:
+    """Return values (m,) that are ``other`` but for the points ``at`` (q,)."""
+    taken = np.full(m, other)
+    taken[at] = values
     return taken
 
 

@@ -93,39 +93,47 @@ def cost_of_staying(state: State, matched: MatchedObservation) -> tuple[BoolArra
 MEMORY_S = 60.0
 """Time, seconds, after which what was seen counts for a third."""
 
-RARE_SHARE = 0.0017
-"""Share of points that are of new landmarks at which one costs as much as a point at the gate."""
-
 SHARE_AT_FIRST, POINTS_AT_FIRST = 0.05, 10.0
 """The share as it is taken to be before anything was seen, and how many points that counts for."""
 
-LEAST_COST = 9.0
-"""What a new landmark costs at least: else many a true pair, beyond 3 σ, would cost more."""
+LEAST_COST = 6.0
+"""What a point of no known landmark costs at least: else many a true pair, at 2.5 σ, would cost
+more.
+"""
 
 
 class NewLandmarks:
-    """What it costs to take a point for a new landmark; −2 ln of a likelihood.
+    """What it costs to take a point for a new landmark or a false point; −2 ln of a likelihood.
 
-    On new ground many points are of new landmarks, and one that could only just be of a known one
-    is not. Where all is known it hardly ever is a new one.
+    Such points are anywhere in the volume in which the sensor sees. On new ground they are many.
+    Where all is known a point that could only just be of a known landmark hardly ever is another.
     """
 
     def __init__(self) -> None:
-        self._points = self._new = 0.0  # of late
+        self._observations = self._points = self._new = 0.0  # of late
         self._stamp_ns: int | None = None
 
-    def cost(self, gate_cost: float) -> float:
-        """Return the cost; a point at the gate has ``gate_cost``, which is the most."""
-        share = (self._new + SHARE_AT_FIRST * POINTS_AT_FIRST) / (self._points + POINTS_AT_FIRST)
-        cost = gate_cost - 2.0 * math.log(share / RARE_SHARE)
-        return min(max(cost, min(LEAST_COST, gate_cost)), gate_cost)
+    def costs(self, noise: FloatArray, volume: float, most: float) -> FloatArray:
+        """Return the cost (m,) of each point, which has ``noise`` (m, k, k), m².
 
-    def note(self, event: ObservationEvent, confirmed: int) -> None:
-        """Count an observation, and how many landmarks it ``confirmed``."""
+        It is −2 ln λ √|2π R|, λ being how many there are in an observation and a unit of
+        ``volume``, m^k, of what the sensor sees; and ``most`` where that is not known.
+        """
+        if not volume:
+            return np.full(len(noise), most)
+        share = (self._new + SHARE_AT_FIRST * POINTS_AT_FIRST) / (self._points + POINTS_AT_FIRST)
+        density = share * max(self._points / max(self._observations, 1.0), 1.0) / volume
+        costs = -2.0 * math.log(density) - np.linalg.slogdet(2.0 * math.pi * noise)[1]
+        return np.asarray(np.clip(costs, min(LEAST_COST, most), most))
+
+    def note(self, event: ObservationEvent, new: int) -> None:
+        """Count an observation, and how many landmarks turned out to be ``new``, or false."""
         if self._stamp_ns is not None:
             decay = math.exp(-max(to_s(event.stamp_ns - self._stamp_ns), 0.0) / MEMORY_S)
+            self._observations *= decay
             self._points *= decay
             self._new *= decay
         self._stamp_ns = event.stamp_ns
+        self._observations += 1.0
         self._points += len(event.ids)
-        self._new += confirmed
+        self._new += new

@@ -54,12 +54,6 @@ from slam_observer_ros.tracking.standing import Drift, MAX_MOTIONS, Standing, ta
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.step import step
 
-MOST_WITHOUT_IDS = 2
-"""Hypotheses that are followed at most where points have no ids: each costs as much as the first,
-and a third one is hardly ever the right one.
-"""
-
-
 AMBIGUOUS = 4.0
 """Deviation of the pose by all hypotheses, over what the best one states, in any direction, from
 which on they are several maps and not one.
@@ -409,16 +403,14 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
         if unknown:
-            self._new_landmarks.note(event, self._all[0].visibility.confirmed_now)
+            visibility = self._all[0].visibility
+            self._new_landmarks.note(event, visibility.sure_now + visibility.false_now)
         return children[0].update
 
     def _follow(
         self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
     ) -> list[_Child]:
         """Let hypotheses use an observation as interpreted; return them, the cheapest first."""
-        limit = self._limit
-        if (event.ids == UNKNOWN_ID).all():
-            limit = min(limit, MOST_WITHOUT_IDS)
         # A state is copied for each use of it but the last.
         uses = Counter(number for number, taken in possible if taken.slipped is None)
         children: list[_Child] = []
@@ -434,7 +426,7 @@ class Hypotheses:
             child = self._child(hypothesis, taken, event)
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
-            if len(children) == limit:
+            if len(children) == self._limit:
                 break
         return sorted(children, key=lambda child: child.hypothesis.cost)
 
@@ -448,7 +440,13 @@ class Hypotheses:
             update = step(state, taken.matched or match(state, taken.event))
         hypothesis.cost = taken.cost
         if (event.ids == UNKNOWN_ID).any():
-            hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
+            visibility, ids = hypothesis.visibility, taken.event.ids
+            if taken.evidence is not None:
+                rows = state.landmarks.rows_of(ids)
+                visibility.sure_now = state.landmarks.weigh(
+                    rows[rows >= 0], taken.evidence[rows >= 0]
+                )
+            hypothesis.cost += visibility.note(state, taken.event, self._some_have_ids)
         return _Child(hypothesis, taken.event, update)
 
     def _interpret(
@@ -461,14 +459,16 @@ class Hypotheses:
         matched it, None where there are several.
         """
         new_ids, margin = self._new_ids(len(event.ids)), pruning_cost(event.ids)
-        gate_cost = unpaired_cost(self.best.settings.rejection_threshold)
-        new_cost = self._new_landmarks.cost(gate_cost)
+        gate_cost, k = unpaired_cost(self.best.settings.rejection_threshold), self.best.axes.point
+        noise = self.best.observation_noise.covariances(event)[:, :k, :k]
+        volume = self._all[0].visibility.field_of_view.volume
+        new_costs = self._new_landmarks.costs(noise, volume, gate_cost)
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, hypothesis in enumerate(self._all):
             cost = hypothesis.cost
             budget = worst - cost
-            for taken in self._meanings(hypothesis, event, matched, new_ids, new_cost, budget):
+            for taken in self._meanings(hypothesis, event, matched, new_ids, new_costs, budget):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
@@ -480,19 +480,19 @@ class Hypotheses:
         event: ObservationEvent,
         matched: MatchedObservation | None,
         new_ids: IntArray,
-        new_cost: float,
+        new_costs: FloatArray,
         budget: float,
     ) -> list[Interpretation]:
         """Return what an observation may mean to a hypothesis: :func:`.interpretations`."""
         state, index = hypothesis.state, hypothesis.index
         seen = calibrated(state, event)
         if matched is not None:
-            return interpretations(state, index, seen, matched, new_ids, new_cost, budget, True)
+            return interpretations(state, index, seen, matched, new_ids, new_costs, budget, True)
         used = in_parts.observe(state, event, with_expected=True)
         if used is not None:
             return [as_its_ids_say(state, seen, *used)]
         matched = match(state, seen)
-        return interpretations(state, index, seen, matched, new_ids, new_cost, budget)
+        return interpretations(state, index, seen, matched, new_ids, new_costs, budget)
 
     def _new_ids(self, m: int) -> IntArray:
         """Return ids (m,) that no landmark of any hypothesis has, nor one of a loaded map."""
@@ -509,11 +509,9 @@ def _lasting(ambiguity: Ambiguity | None) -> Ambiguity | None:
 
 def _are_one(child: _Child, other: _Child) -> bool:
     state, other_state = child.hypothesis.state, other.hypothesis.state
-    if are_one(state, child.event, other_state, other.event):
-        return True
-    # Where landmarks have ids, these will show.
-    without_ids = is_automatic(state.landmarks.ids).all()
-    return bool(without_ids) and have_one_map(state, other_state)
+    if is_automatic(state.landmarks.ids).all():
+        return have_one_map(state, other_state)
+    return are_one(state, child.event, other_state, other.event)  # else ids will show
 
 
 def have_one_map(state: State, other: State) -> bool:

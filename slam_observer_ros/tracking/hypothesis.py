@@ -88,6 +88,7 @@ class FieldOfView:
     def __init__(self, k: int) -> None:
         self.corners = np.zeros((1, k))  # (q, k) the base and points that span the hull, metres
         self._faces: FloatArray = np.empty((0, k + 1))
+        self.volume = 0.0  # of its inside, m^k
         self._margin_m = 0.0
 
     @property
@@ -110,6 +111,7 @@ class FieldOfView:
             self.corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
             return
         self.corners, self._faces = corners[hull.vertices], hull.equations
+        self.volume = float(hull.volume)
         self._margin_m = HULL_MARGIN * float(np.ptp(self.corners, axis=0).max())
 
     def contains(self, points: FloatArray) -> BoolArray:
@@ -133,8 +135,9 @@ class Visibility:
     """The view of a sensor without ids, in ``k`` = 2 or 3 dimensions: what it sees and misses."""
 
     def __init__(self, k: int) -> None:
-        self._field_of_view = FieldOfView(k)
-        self.confirmed_now = 0  # how many landmarks without an id the last observation confirmed
+        self.field_of_view = FieldOfView(k)
+        # landmarks without an id that surely exist since the last observation, and false ones
+        self.sure_now = self.false_now = 0
         self._last_place: FloatArray | None = None  # (4, 4) Â, if it moved since the one before
         # −ln of the probability that for so long none is seen of the landmarks known before: those
         # without an id that were numbered up to here.
@@ -146,7 +149,7 @@ class Visibility:
     def copy(self) -> Visibility:
         """Return an independent copy: no array is ever changed in place."""
         other = copy(self)
-        other._field_of_view = copy(self._field_of_view)
+        other.field_of_view = copy(self.field_of_view)
         return other
 
     def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
@@ -154,31 +157,28 @@ class Visibility:
 
         Some of its points came without an id. Unless others have one (``some_have_ids``), which
         show better where the robot is, the pose is counted as unexpected if none of the landmarks
-        in view was seen for so long that it is no chance any more. Landmarks that were seen too
-        seldom while in view are forgotten; landmarks out of view never: one may be the only tie
-        to an older part of the map. Return −2 ln of the probability that confirmed landmarks in
-        view were missed.
+        in view was seen for so long that it is no chance any more. Landmarks that
+        hardly exist are forgotten; landmarks out of view never: one may be the only tie to an
+        older part of the map. Return −2 ln of the probability that landmarks in view were missed.
         """
         # What should have been seen, and was.
         landmarks = state.landmarks
         is_numbered, everything = is_automatic(landmarks.ids), np.arange(len(landmarks))
         seen = landmarks.last_seen_ns == event.stamp_ns
-        in_view = seen | self._field_of_view.contains(state.observer.body_points(everything))
+        in_view = seen | self.field_of_view.contains(state.observer.body_points(everything))
         if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
             state.counts['unexpected_place'] += 1
         # Those without an id of their own: what it costs to have missed them, and their counts.
         rows = np.flatnonzero(is_numbered & in_view)
-        cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
+        cost = self._miss(landmarks, rows[~seen[rows]])
         self.missed = self._missed(in_view & ~landmarks.tentative, seen)
         landmarks.note_in_view(rows, seen[rows], self._has_moved(state))
         if not some_have_ids:  # landmarks of a loaded map, by their ids
             landmarks.note_missed(np.flatnonzero(~is_numbered & in_view), seen)
-        self._field_of_view.include(event.points)
-        # Landmarks seen too seldom, and landmarks that were confirmed.
-        were_tentative = np.count_nonzero(landmarks.tentative)
-        unsupported = landmarks.unsupported(state.settings.min_support)
-        self.confirmed_now = int(were_tentative - np.count_nonzero(landmarks.tentative))
-        state.forget(unsupported, Change.UNSUPPORTED, event.stamp_ns)
+        self.field_of_view.include(event.points)
+        unlikely = landmarks.unlikely()
+        self.false_now = len(unlikely)
+        state.forget(unlikely, Change.UNSUPPORTED, event.stamp_ns)
         return cost
 
     def _has_moved(self, state: State) -> bool:
@@ -194,24 +194,19 @@ class Visibility:
 
     def _missed(self, in_view: BoolArray, seen: BoolArray) -> float:
         """Return how many landmarks (n,) in view should have been seen, and were not."""
-        if not self._field_of_view.is_known:
+        if not self.field_of_view.is_known:
             return 0.0
         share = self._seen / self._in_view
         self._in_view += int(np.count_nonzero(in_view))
         self._seen += int(np.count_nonzero(in_view & seen))
         return share * int(np.count_nonzero(in_view & ~seen))
 
-    def _cost(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
-        """Return the cost of confirmed landmarks (u,) in view that were missed once more.
-
-        The rate at which one in view is seen differs between landmarks and poses. Where it is
-        exponentially distributed about its mean p, one is missed k times in a row with the
-        probability 1/(1 + k p): one that is hidden soon costs little more.
-        """
-        if not self._field_of_view.is_known:
-            return 0.0
-        p, missed = landmarks.likely_share, landmarks.missed[unseen]
-        return 2.0 * float(np.sum(np.log1p(p / (1.0 + missed * p))))
+    def _miss(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
+        """Let landmarks (u,) in view be missed once more; return what that costs."""
+        hidden, exist = landmarks.hidden(unseen), landmarks.existence(unseen)
+        landmarks.weigh(unseen, np.log(hidden))
+        cost = -2.0 * float(np.sum(np.log1p(exist * (hidden - 1.0))))
+        return cost if self.field_of_view.is_known else 0.0
 
     def _add_evidence(
         self,
@@ -225,7 +220,7 @@ class Visibility:
         old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)
         if (old & seen).any():
             self._evidence = 0.0
-        elif len(event.points) and self._field_of_view.is_known:
+        elif len(event.points) and self.field_of_view.is_known:
             evidence = -math.log1p(-landmarks.likely_share) * int(np.sum(old))
             self._evidence += min(evidence, MAX_EVIDENCE)
         is_unexpected = self._evidence > IMPROBABLE

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, IntArray, is_automatic
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.observer import Residuals
@@ -52,6 +52,8 @@ class Interpretation:
     named_rows: IntArray = field(default_factory=_none)
     given_ids: IntArray = field(default_factory=_none)
     matched: MatchedObservation | None = None  # with the landmarks of these ids, where it is so
+    # (m,) that each point's landmark exists; None if its id says so
+    evidence: FloatArray | None = None
     update: Update | None = None  # where the state has already used it so
 
 
@@ -61,7 +63,7 @@ def interpretations(
     event: ObservationEvent,
     matched: MatchedObservation,
     new_ids: IntArray,
-    new_cost: float,
+    new_costs: FloatArray,
     budget: float,
     is_alone: bool = False,
 ) -> list[Interpretation]:
@@ -69,7 +71,7 @@ def interpretations(
 
     ``state`` is at its instant, ``index`` has its landmarks, ``matched`` is the observation
     with the landmarks that its ids name. Points taken for landmarks not seen before get
-    ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
+    ``new_ids`` (m,), at costs ``new_costs`` (m,) for those without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """
@@ -79,12 +81,12 @@ def interpretations(
         if is_contradiction(rejected):
             return _rejected_or_slipped(state, matched, event, rejected)
     if some_are_unknown or may_name(state, matched):
-        found = find_assignments(state, index, event, new_cost, budget, is_alone)
+        found = find_assignments(state, index, event, new_costs, budget, is_alone)
         possible = [_with_ids(state, event, assignment, new_ids) for assignment in found]
         # In a loaded map a robot that is elsewhere is sought anywhere.
         is_own = bool(is_automatic(state.landmarks.ids).all())
         if is_own and (event.ids == UNKNOWN_ID).all():
-            possible += _slips_without_ids(state, index, event, new_ids, new_cost, found)
+            possible += _slips_without_ids(state, index, event, new_ids, new_costs, found)
         return possible
     cost = pairing_cost(state, len(event.ids), matched.residuals)
     return [Interpretation(event, cost, matched=matched)]
@@ -169,24 +171,26 @@ def _slips_without_ids(
     index: LandmarkIndex,
     event: ObservationEvent,
     new_ids: IntArray,
-    new_cost: float,
+    new_costs: FloatArray,
     found: list[Assignment],
 ) -> list[Interpretation]:
     """Take the robot for slipped, where more points are new than a slip is unlikely."""
     new = min((int(np.sum(one.rows < 0)) for one in found), default=len(event.ids))
-    if new * new_cost <= SLIP_COST or not len(state.landmarks):
+    cost = min((float(new_costs[one.rows < 0].sum()) for one in found), default=np.inf)
+    if cost <= SLIP_COST or not len(state.landmarks):
         return []
     slips: dict[bytes, Interpretation] = {}
     for other in astray(state):
-        for assignment in find_assignments(other, index, event, new_cost, np.inf, False)[:1]:
+        for assignment in find_assignments(other, index, event, new_costs, np.inf, False)[:1]:
             is_new, taken_for = assignment.rows < 0, assignment.rows.tobytes()
             if np.sum(is_new) >= new or taken_for in slips:
                 continue
             taken = _with_ids(state, event, assignment, new_ids).event
             slipped = _after_slip(state, match(state, taken), taken)
             if slipped is not None:
-                spared = np.sum(is_new) * (outlier_cost(state) - new_cost)
-                slips[taken_for] = replace(slipped, cost=slipped.cost - float(spared))
+                spared = float(np.sum(outlier_cost(state) - new_costs[is_new]))
+                evidence, cost = assignment.evidence, slipped.cost - spared
+                slips[taken_for] = replace(slipped, cost=cost, evidence=evidence)
     return list(slips.values())
 
 
@@ -209,4 +213,5 @@ def _with_ids(
         assignment.cost,
         named_rows=rows[is_named],
         given_ids=event.ids[is_named],
+        evidence=assignment.evidence,
     )

@@ -90,8 +90,9 @@ class _Extensions:
 class JointSearch:
     """The pairings that cost little more than the cheapest.
 
-    ``certain`` (q,) are the pairs whose point is of some known landmark in any case, and
-    ``unpaired_costs`` (q,) what the pair's point costs if it is of none. A pairing may cost
+    ``certain`` (q,) are the pairs whose point is of some known landmark in any case,
+    ``unpaired_costs`` (q,) what the pair's point costs if it is of none, and ``pair_costs`` (q,)
+    what pairs cost more whose landmark may not exist. A pairing may cost
     ``margin`` more than the cheapest, and ``budget`` in all.
     """
 
@@ -102,6 +103,7 @@ class JointSearch:
         unpaired_costs: FloatArray,
         margin: float,
         budget: float = math.inf,
+        pair_costs: FloatArray | float = 0.0,
     ) -> None:
         self._pairs = pairs
         self._certain = certain
@@ -111,7 +113,8 @@ class JointSearch:
         # Points with the fewest options first: they are the surest, and the others follow them.
         order = points[np.argsort(counts, kind='stable')]
         self._options = [np.flatnonzero(pairs.points == point) for point in order]
-        self._noise_log_dets = np.linalg.slogdet(pairs.noise)[1]
+        # (q,) what the rise of the cost with a pair is less by
+        self._less = np.linalg.slogdet(pairs.noise)[1] - pair_costs
 
     def all_pairs(self) -> Pairing | None:
         """Return the pairing of all pairs; None if one of them is better left out.
@@ -124,7 +127,7 @@ class JointSearch:
         z = L @ pairs.residuals.ravel()
         log_dets = np.log(np.diagonal(L)).reshape(q, k).sum(axis=1)
         rises = huber_loss(np.linalg.norm(z.reshape(q, k), axis=1)) - 2.0 * log_dets
-        rises -= self._noise_log_dets
+        rises -= self._less
         cost = float(rises.sum())
         if (rises > self._unpaired_costs).any() or cost > self._budget:
             return None
@@ -177,7 +180,7 @@ class JointSearch:
         log_dets = np.log(np.diagonal(corners, axis1=2, axis2=3)).sum(axis=2)
         rises = huber_loss(np.sqrt((tails * tails).sum(axis=2))) - 2.0 * log_dets
         rises[self._are_taken(pairings, options)] = np.inf
-        rises -= self._noise_log_dets[options]
+        rises -= self._less[options]
         is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
         without = np.where(is_certain, np.inf, self._unpaired_costs[options[0]])
         before = np.array([[pairing.cost] for pairing in pairings])

@@ -55,7 +55,7 @@ def after_a_loop(points, seen, seed=0):
     state.gains.add(body, np.tile(SIGMA_M**2 * np.eye(3), (len(seen), 1, 1)))
     state.landmarks.add(FIRST_AUTOMATIC_ID + len(points) + np.arange(len(seen)), LOOP_NS)
     state.landmarks.counts[:] = 9
-    state.landmarks.tentative[:] = False
+    state.landmarks.evidence[:] = np.inf
     return state, true_pose
 
 
@@ -115,7 +115,7 @@ def twins(apart_m):
     state.gains.add_known(KnownLandmarks(points, covariances))
     state.landmarks.add(FIRST_AUTOMATIC_ID + np.arange(len(points)), 0)
     state.landmarks.counts[:] = 9
-    state.landmarks.tentative[:] = False
+    state.landmarks.evidence[:] = np.inf
     state.landmarks.last_seen_ns[-1] = 5
     return state
 

@@ -139,7 +139,7 @@ def test_a_changed_setting_is_in_force_from_the_next_observation_on(row, gains, 
 
 @pytest.mark.parametrize('row', OTHERS, ids=lambda row: row.name)
 def test_a_changed_setting_is_in_force_where_points_have_no_ids(row):
-    settings, other = settings_and_other(row, 'riccati', min_support=2)
+    settings, other = settings_and_other(row, 'riccati', confirmations=2)
     before, after = split_before_observation(events_of(settings, with_ids=False), 1)
     changed, made = Estimator(settings), Estimator(other)
     add_all(before, changed, made)

@@ -69,13 +69,13 @@ def test_the_same_events_give_the_same_bits():
     assert_array_equal(first.world_points, second.world_points)
 
 
-def test_what_is_seen_once_or_twice_is_never_in_the_map_and_soon_forgotten():
+def test_what_is_seen_once_is_never_in_the_map_and_by_and_by_forgotten():
     estimator = Estimator(SPATIAL)
-    for step in range(150):
+    for step in range(400):
         stand(estimator, 0.1 * step)
-        stray = [[0.0, 4.0, 1.0]] if step in (20, 21) else []
+        stray = [[0.0, 4.0, 1.0]] if step == 20 else []
         observe(estimator, 0.1 * step, [[3.0, 0.0, 0.0], *stray])
-        assert len(estimator.landmark_ids) == (1 if step >= 4 else 0)
+        assert len(estimator.landmark_ids) == (1 if step >= 2 else 0)
     assert estimator.counts['unsupported_landmark'] == 1
 
 
@@ -224,7 +224,7 @@ def test_it_says_that_landmarks_are_seen_too_seldom_for_a_map():
     (finding,) = of_map_without_ids(estimator, None)
     assert finding.kind == 'unconfirmed_map'
     assert 'only 0 are in the map' in finding.what
-    for step in range(12, 60):
+    for step in range(12, 200):
         stand(estimator, float(step))
         observe(estimator, float(step), np.array([[3.0, 44.0, 0.0], [3.0, 40.0, 0.0]]))
     assert len(estimator.landmark_ids) == 2
@@ -286,17 +286,18 @@ def test_hypotheses_are_one_where_no_view_to_come_can_show_which_is_right():
     assert not have_one_map(state, elsewhere), 'the robot is elsewhere'
     more.remove(np.array([2]))
     assert have_one_map(state, more) and have_one_map(more, state)
-    state.landmarks.tentative[2] = False
+    state.landmarks.evidence[2] = np.inf
     assert not have_one_map(state, more), 'a landmark that is sure is in one of them'
     assert not have_one_map(more, state)
 
 
 def test_the_covariance_of_a_map_is_that_of_all_hypotheses():
-    estimator = Estimator(replace(PLANAR, confirmations=1, min_support=1))
+    estimator = Estimator(replace(PLANAR, confirmations=1))
     stand(estimator, 0.0)
     points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
     observe(estimator, 0.0, points)
     hypotheses = estimator._hypotheses
+    hypotheses.best.landmarks.evidence[:] = np.inf
     own = estimator.configuration_covariance(np.arange(2))
     other = hypotheses._all[0].copy()
     other.cost = 2.0 * np.log(3.0)  # one in four
@@ -359,7 +360,7 @@ def test_a_robot_finds_its_way_in_a_map_by_reflectors_that_all_look_alike(mode):
 
 
 def test_numbers_given_to_landmarks_in_two_runs_say_nothing_of_which_is_which():
-    estimator = Estimator(replace(SPATIAL, confirmations=1, min_support=1))
+    estimator = Estimator(replace(SPATIAL, confirmations=1))
     tags = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
     nameless_point = np.array([[3.0, 3.0, 0.0]])
     for step in range(3):

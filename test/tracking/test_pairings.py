@@ -143,12 +143,17 @@ def test_the_index_misses_no_landmark_while_they_move_and_change_in_number(seed,
 
 
 def test_on_new_ground_a_new_landmark_costs_less_and_where_all_is_known_as_much_as_the_gate():
-    new, gate_cost = NewLandmarks(), huber_loss(6.0)
+    """One in each observation of 50 m², measured to 0.1 m."""
+    new, gate_cost, noise = NewLandmarks(), huber_loss(6.0), 0.01 * np.eye(2)[None]
     event = ObservationEvent(0, np.full(5, UNKNOWN_ID), np.zeros((5, 3)))
     for second in range(100):
-        new.note(replace(event, stamp_ns=second * 10**9), confirmed=1)
-    assert new.cost(gate_cost) == pytest.approx(gate_cost - 2.0 * np.log(0.2 / 0.0017), abs=0.1)
+        new.note(replace(event, stamp_ns=second * 10**9), new=1)
+    expected = -2.0 * np.log(2.0 * np.pi * 0.01 / 50.0)
+    assert new.costs(noise, 50.0, gate_cost) == pytest.approx(expected, abs=0.1)
+    finer = new.costs(0.25 * noise, 50.0, gate_cost)
+    assert finer == pytest.approx(expected + 2.0 * np.log(4.0), abs=0.1)
+    assert new.costs(noise, 0.0, gate_cost) == gate_cost, 'nobody knows what the sensor sees'
     for second in range(100, 600):
-        new.note(replace(event, stamp_ns=second * 10**9), confirmed=0)
-    assert new.cost(gate_cost) == pytest.approx(gate_cost, abs=0.6)
-    assert new.cost(4.0) == 4.0, 'no more than a point at the gate'
+        new.note(replace(event, stamp_ns=second * 10**9), new=0)
+    assert new.costs(noise, 50.0, gate_cost) == gate_cost
+    assert new.costs(noise, 50.0, 4.0) == 4.0, 'no more than a point at the gate'

@@ -13,7 +13,13 @@ from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
-from slam_observer_ros.filter.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM
+from slam_observer_ros.filter.landmark_table import (
+    ERROR,
+    LandmarkTable,
+    LEAST_COUNT,
+    MOST_EVIDENCE,
+    TOO_SELDOM,
+)
 from slam_observer_ros.tracking.hypothesis import FieldOfView, Visibility
 from slam_observer_ros.tracking.state import State
 
@@ -53,74 +59,79 @@ def test_where_all_points_lie_in_one_plane_all_of_space_counts_as_in_view():
     assert field.contains(np.array([[0.0, 0.0, 5.0], [9.0, 0.0, 0.0]])).all()
 
 
-def looked_at(counts, looks, settled_looks=0, settled_seen=0):
-    """A table of landmarks without ids, after one that has settled was in view and seen so often.
-
-    The landmark of row 0 is that one, the next have ``counts`` and ``looks``.
-    """
+def table(counts, looks=0, seen=0):
+    """Landmarks without ids: row 0 of a map, seen so often of so many looks, and further ones."""
     landmarks = LandmarkTable()
     landmarks.append_zeros(1)
     landmarks.add_known(np.array([FIRST_AUTOMATIC_ID]), np.array([100]))
     landmarks.append_zeros(len(counts))
     landmarks.add(FIRST_AUTOMATIC_ID + 1 + np.arange(len(counts)), 0)
     landmarks.counts[1:] = counts
-    for look in range(settled_looks):
-        landmarks.note_in_view(np.array([0]), np.array([look < settled_seen]))
-    for row, times in enumerate(looks, start=1):
-        for _ in range(times):
-            landmarks.note_in_view(np.array([row]), np.array([False]), has_moved=False)
+    for look in range(looks):
+        landmarks.note_in_view(np.array([0]), np.array([look < seen]))
     return landmarks
 
 
-def test_a_landmark_seen_far_more_seldom_than_others_in_view_is_unsupported():
-    landmarks = looked_at([1, 4, 4, 5], [50, 50, 20, 50], settled_looks=996, settled_seen=499)
-    assert landmarks.unsupported(5).tolist() == [1, 2]
-    assert landmarks.unsupported(1).tolist() == []
+def miss(landmarks, row, times):
+    """Let a landmark in view be missed so many times in a row."""
+    for _ in range(times):
+        landmarks.weigh(np.array([row]), np.log(landmarks.hidden(np.array([row]))))
+        landmarks.note_in_view(np.array([row]), np.array([False]), has_moved=False)
 
 
-def test_where_all_are_seen_seldom_it_takes_longer():
-    landmarks = looked_at([1, 1], [199, 201], settled_looks=1000, settled_seen=100)
-    assert landmarks.unsupported(5).tolist() == [2]
+@pytest.mark.parametrize('share', [0.1, 0.5, 0.9])
+def test_a_landmark_exists_less_surely_with_each_look_that_misses_it(share):
+    """By 1/(1 + k p) after k of them: from one place it may be hidden in all."""
+    landmarks = table([1], 100, round(100 * share))
+    odds = np.exp(landmarks.prior)
+    for misses in (1, 4, 15):
+        miss(landmarks, 1, misses - landmarks.missed[1])
+        left = odds / (1.0 + misses * share)
+        assert_allclose(landmarks.existence(np.array([1]))[0], left / (1.0 + left))
 
 
-def test_what_has_settled_stays_however_long_it_is_hidden_from_one_place():
-    landmarks = looked_at([5], [0], settled_looks=100, settled_seen=100)
-    assert landmarks.unsupported(5).tolist() == []
-    for _ in range(1000):
-        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]), has_moved=False)
-    assert landmarks.unsupported(5).tolist() == []
+def test_a_landmark_enters_the_map_once_it_surely_exists_and_stays_while_it_may_be_hidden():
+    landmarks = table([3], 10, 9)
+    assert landmarks.tentative.tolist() == [False, True]
+    assert landmarks.weigh(np.array([1]), np.array([9.0])) == 1
+    assert landmarks.existence(np.array([1]))[0] > 1.0 - ERROR
+    assert landmarks.weigh(np.array([1]), np.array([np.inf])) == 0
+    assert landmarks.evidence[1] == MOST_EVIDENCE
+    miss(landmarks, 1, 200)
+    assert landmarks.tentative.tolist() == [False, False]
+    assert landmarks.unlikely().tolist() == []
+
+
+def test_where_many_points_are_false_a_new_one_is_sooner_forgotten():
+    looks = []
+    for others in (0, 40):
+        landmarks = table([1] * (1 + others), 100, 90)
+        landmarks.evidence[2:] = -9.0
+        while 1 not in landmarks.unlikely():
+            miss(landmarks, 1, 1)
+        looks.append(landmarks.missed[1])
+    assert looks[1] < looks[0] / 10
+
+
+def test_nothing_is_taken_for_false_before_it_was_missed():
+    landmarks = table([1] * 200)
+    for _ in range(20):
+        assert landmarks.unlikely().tolist() == []
+    assert (landmarks.existence(np.arange(201)) > 0.9).all()
 
 
 @pytest.mark.parametrize('counts', [5, 20])
-def test_what_has_settled_goes_if_it_is_seen_five_times_too_seldom_from_many_places(counts):
-    landmarks = looked_at([counts], [0], settled_looks=100, settled_seen=100)
-    landmarks.unsupported(5)
-    for _ in range(TOO_SELDOM * counts - 1):
-        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
-        landmarks._confirmed_in_view = landmarks._confirmed_seen  # others are seen each time
-    assert landmarks.unsupported(5).tolist() == []
-    landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
-    landmarks._confirmed_in_view = landmarks._confirmed_seen
-    assert landmarks.unsupported(5).tolist() == [1]
-
-
-def test_nothing_is_forgotten_before_it_is_known_how_often_a_landmark_is_seen():
-    landmarks = looked_at([1, 4], [1000, 1000])
-    assert landmarks.unsupported(5).tolist() == []
-
-
-def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_before():
-    """One has settled, and was seen each time; the other one never was but once."""
-    landmarks, both = LandmarkTable(), np.array([0, 1])
-    landmarks.append_zeros(2)
-    landmarks.add(FIRST_AUTOMATIC_ID + both, 0)
-    landmarks.note_in_view(both, np.array([True, True]))
-    for look in range(1, 3 * PATIENCE):
-        assert landmarks.unsupported(3).tolist() == []
-        landmarks.accept(both[:1], look)
+def test_what_surely_existed_goes_if_it_is_seen_five_times_too_seldom_from_many_places(counts):
+    landmarks, both = table([counts], 100, 100), np.array([0, 1])
+    landmarks.weigh(both, np.full(2, 99.0))
+    for _ in range(1000):
+        landmarks.note_in_view(both, np.array([True, False]), has_moved=False)
+    assert landmarks.unlikely().tolist() == []
+    for _ in range(TOO_SELDOM * max(counts, LEAST_COUNT)):
+        assert landmarks.unlikely().tolist() == []
         landmarks.note_in_view(both, np.array([True, False]))
-    assert landmarks.counts.tolist() == [3 * PATIENCE, 1]
-    assert landmarks.unsupported(3).tolist() == [1]
+        landmarks._confirmed_in_view = landmarks._confirmed_seen  # others are seen each time
+    assert landmarks.unlikely().tolist() == [1]
 
 
 def state_of(landmarks, points):
@@ -147,7 +158,7 @@ def test_before_it_is_known_where_a_sensor_looks_no_place_is_unexpected():
 @pytest.mark.parametrize('misses', [1, 5, 40])
 def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_soon_no_more(misses):
     """After k looks that miss it 2 ln(1 + k p): for the first one much, by and by little."""
-    landmarks, share, visibility = looked_at([], [], 10, 5), 0.5, Visibility(2)
+    landmarks, share, visibility = table([], 10, 5), 0.5, Visibility(2)
     state = state_of(landmarks, np.array([[2.0, 0.0, 0.0]]))
     ahead = 4.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]])
     others = ObservationEvent(10, np.full(2, UNKNOWN_ID), ahead)
@@ -161,14 +172,15 @@ def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_so
     assert visibility.note(state, others, some_have_ids=False) == 0.0
 
 
-def test_a_landmark_that_was_given_its_id_needs_no_support_any_more():
-    landmarks = looked_at([1, 1], [40, 40], settled_looks=10, settled_seen=10)
+def test_a_landmark_that_was_given_an_id_exists():
+    landmarks = table([1, 1])
+    landmarks.evidence[1:] = -20.0
     landmarks.renumber(np.array([1]), np.array([7]))
-    assert landmarks.unsupported(5).tolist() == [2]
+    assert landmarks.unlikely().tolist() == [2]
 
 
-def test_a_landmark_that_was_placed_again_has_its_chance_again():
-    landmarks = looked_at([4], [39], settled_looks=996, settled_seen=499)
+def test_a_landmark_that_was_placed_again_is_as_likely_as_a_new_one():
+    landmarks = table([4])
+    landmarks.evidence[1] = -20.0
     landmarks.take_for_new(np.array([1]), 0)
-    landmarks.note_in_view(np.array([1]), np.array([False]))
-    assert landmarks.unsupported(5).tolist() == []
+    assert landmarks.unlikely().tolist() == []
