@@ -424,8 +424,8 @@ KINDS = {
     ),
     'unconfirmed_map': Kind(
         Level.WARNING,
-        '{waiting} landmarks without ids were seen too seldom to be sure that they exist, and only '
-        '{known} are in the map',
+        '{waiting} landmarks without ids were seen too seldom to be sure that they exist, and '
+        'only {known} are in the map',
         'drive more slowly, or see them more often',
     ),
     'wrong_pose': Kind(

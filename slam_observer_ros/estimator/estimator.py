@@ -384,14 +384,24 @@ class Estimator(Estimate):
                     self._localiser.doubt_strayed(self._state, update)
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
-            is_alone = len(self._hypotheses) == 1
-            if self._loop_closure.follow(self._state, event.stamp_ns, is_alone=is_alone):
-                self._hypotheses.prune_to_best()
+            self._find_doubled(event.stamp_ns)
         distance_m = math.hypot(*self._state.observer.A[:3, 3].tolist())
         has_diverged = not distance_m <= DIVERGED_M  # or it is no number
         if has_diverged:
             self._start_again(distance_m)
         return bool(self._localiser.maps) or some_are_unknown or has_diverged
+
+    def _find_doubled(self, stamp_ns: int) -> None:
+        """Take landmarks without ids for one that turn out to be, after an observation."""
+        closure = self._loop_closure
+        closure.note(self._state, stamp_ns)
+        if closure.is_due(self._state, stamp_ns):
+            if closure.close(self._state, stamp_ns):
+                self._hypotheses.prune_to_best()
+            # A map of its own, while it is sought in a loaded one, decides nothing of that.
+            if not self._localiser.maps or self._localiser.is_localised:
+                self._hypotheses.fork(closure.twins)
+            closure.count_doubled(self._state)
 
     def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""

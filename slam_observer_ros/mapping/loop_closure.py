@@ -9,6 +9,7 @@ these lie to each other as old ones do, in one way only, they are those.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Set
 import logging
 import math
 
@@ -20,6 +21,7 @@ from slam_observer_ros.filter.robust import accepted
 from slam_observer_ros.lie.matrices import cholesky, mahalanobis
 from slam_observer_ros.mapping.merging import without_frame
 from slam_observer_ros.settings.estimator_settings import ERROR_PROBABILITY
+from slam_observer_ros.tracking.hypothesis import Twins
 from slam_observer_ros.tracking.state import State
 
 logger = logging.getLogger(__name__)
@@ -65,25 +67,6 @@ class LoopClosure:
         self._near_m = math.inf  # how far side by side is
         self._doubled: set[tuple[int, int]] = set()  # ids that were counted as such
 
-    def follow(self, state: State, stamp_ns: int, *, is_alone: bool) -> bool:
-        """Merge landmarks that turn out to be one, after an observation of points without ids.
-
-        Return whether a loop has closed. Else nothing is merged that other hypotheses may take
-        for several: unless the state ``is_alone``.
-        """
-        self.note(state, stamp_ns)
-        if not self.is_due(state, stamp_ns):
-            return False
-        merged = state.counts['merged_landmark']
-        has_closed = self.close(state, stamp_ns)
-        if has_closed:
-            merged = state.counts['merged_landmark'] - merged
-            logger.info('A loop has closed: %d landmarks without ids were seen before.', merged)
-        if is_alone or has_closed:
-            self.merge_twins(state)
-            self.count_doubled(state)
-        return has_closed
-
     def note(self, state: State, stamp_ns: int) -> None:
         """Count which landmarks an observation, already used, has shown side by side."""
         landmarks = state.landmarks
@@ -119,20 +102,12 @@ class LoopClosure:
             return False
         self._searched = searched
         pairs = _pairs(state, new, old)
-        return pairs is not None and state.merge(*pairs, MOST) <= MOST
-
-    def merge_twins(self, state: State) -> int:
-        """Merge landmarks that are as near each other as one would be; return how many."""
-        own, merged = _own(state), 0
-        # Per axis, as merge() takes it: at the gate.
-        most = state.settings.rejection_threshold**2 / state.axes.point
-        while len(own) > 2 and (pair := self._twins(state, own)) is not None:
-            if state.merge(*pair, most) > most:
-                break
-            own = own[own != pair[1]]
-            own -= own > pair[1]
-            merged += 1
-        return merged
+        has_closed = pairs is not None and state.merge(*pairs, MOST) <= MOST
+        if pairs is not None and has_closed:
+            logger.info(
+                'A loop has closed: %d landmarks without ids were seen before.', len(pairs[0])
+            )
+        return has_closed
 
     def count_doubled(self, state: State) -> None:
         """Count landmarks that were added where known ones should be seen, and are not.
@@ -164,8 +139,11 @@ class LoopClosure:
         state.counts['doubled_landmark'] += len(doubled)
         self._doubled |= doubled
 
-    def _twins(self, state: State, own: IntArray) -> tuple[IntArray, IntArray] | None:
-        """Return the rows of a landmark and of one which it certainly is, (1,) each."""
+    def twins(self, state: State, apart: Set[tuple[int, int]]) -> Twins | None:
+        """Return two landmarks that are likelier one than two, but for ids ``apart``."""
+        own = _own(state)
+        if len(own) <= 2:
+            return None
         from scipy.spatial import cKDTree  # which only points without ids need
 
         landmarks, k = state.landmarks, state.axes.point
@@ -187,6 +165,7 @@ class LoopClosure:
         alone = np.minimum(landmarks.counts[first], landmarks.counts[second]) - beside
         may_be = beside < HALF * p * (alone + beside)
         may_be &= landmarks.last_seen_ns[first] != landmarks.last_seen_ns[second]
+        may_be &= [(a, b) not in apart for a, b in ids.tolist()]
         if not may_be.any():
             return None
         at, first, second, alone = at[may_be], first[may_be], second[may_be], alone[may_be]
@@ -196,11 +175,12 @@ class LoopClosure:
         may_be_one = accepted(distances, state.settings.rejection_threshold)
         log_density = np.log(np.maximum(densities[at[:, 0]], densities[at[:, 1]]))
         odds = -0.5 * (distances**2 + np.linalg.slogdet(2.0 * math.pi * S)[1]) - log_density
-        odds -= alone * math.log1p(-p)
+        # Seen alone so often as one that was missed in a row: :meth:`.LandmarkTable.hidden`.
+        odds += np.log1p(p * np.maximum(alone, 0))
         best = int(np.argmax(np.where(may_be_one, odds, -np.inf)))
-        is_sure = odds[best] > -math.log(ERROR_PROBABILITY)
-        is_sure &= may_be_one[best]
-        return (first[[best]], second[[best]]) if is_sure else None
+        if not may_be_one[best] or odds[best] <= 0.0:
+            return None
+        return Twins(first[[best]], second[[best]], float(odds[best]))
 
 
 def _own(state: State) -> IntArray:

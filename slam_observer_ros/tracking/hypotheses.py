@@ -10,7 +10,7 @@ well separated there is nearly always one hypothesis.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass, replace
 import math
 
@@ -35,7 +35,7 @@ from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.tracking import in_parts, usual
 from slam_observer_ros.tracking.costs import NewLandmarks
 from slam_observer_ros.tracking.covariances import of_pose
-from slam_observer_ros.tracking.hypothesis import Hypothesis
+from slam_observer_ros.tracking.hypothesis import Hypothesis, Twins
 from slam_observer_ros.tracking.interpretations import (
     as_its_ids_say,
     Interpretation,
@@ -44,6 +44,7 @@ from slam_observer_ros.tracking.interpretations import (
     may_name,
 )
 from slam_observer_ros.tracking.joint_compatibility import (
+    PRUNING_COST,
     pruning_cost,
     RESOLUTION,
     unpaired_cost,
@@ -150,6 +151,27 @@ class Hypotheses:
         self._drift.clear()
         self._all = self._all[:1]
         return self.best
+
+    def fork(self, find: Callable[[State, Set[tuple[int, int]]], Twins | None]) -> None:
+        """Take two landmarks for one where that is likelier; follow both views if it is not sure.
+
+        ``find`` returns such landmarks of a state, but for pairs of ids that are two in any case.
+        """
+        for hypothesis in list(self._all):
+            state = hypothesis.state
+            # Per axis, as merge() takes it: at the gate.
+            most = state.settings.rejection_threshold**2 / state.axes.point
+            while (twins := find(state, hypothesis.apart)) is not None:
+                pair = np.sort(state.landmarks.ids[np.append(twins.rows, twins.copies)])
+                apart = hypothesis.apart | {(int(pair[0]), int(pair[1]))}
+                is_sure = 2.0 * twins.log_odds > PRUNING_COST
+                other = None if is_sure else hypothesis.copy()
+                if state.merge(twins.rows, twins.copies, most) > most:
+                    hypothesis.apart = apart
+                elif other is not None:
+                    other.apart, other.cost = apart, other.cost + 2.0 * twins.log_odds
+                    self._all.append(other)
+        self._all = sorted(self._all, key=lambda one: one.cost)[: self._limit]
 
     def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
@@ -437,7 +459,10 @@ class Hypotheses:
         state, update = hypothesis.state, taken.update
         if update is None:
             state.landmarks.renumber(taken.named_rows, taken.given_ids)
-            update = step(state, taken.matched or match(state, taken.event))
+            used = None
+            if taken.matched is None:  # then its points have no ids but those that it was given
+                used = in_parts.observe(state, replace(event, ids=taken.event.ids))
+            update = used[0] if used else step(state, taken.matched or match(state, taken.event))
         hypothesis.cost = taken.cost
         if (event.ids == UNKNOWN_ID).any():
             visibility, ids = hypothesis.visibility, taken.event.ids

@@ -230,6 +230,15 @@ class Visibility:
         return is_unexpected
 
 
+@dataclass(frozen=True, slots=True)
+class Twins:
+    """Two landmarks that may be one."""
+
+    rows: IntArray  # (1,) the one …
+    copies: IntArray  # (1,) … and the other, which goes
+    log_odds: float  # that they are one
+
+
 @dataclass(slots=True, eq=False)
 class Hypothesis:
     """A state, with the helpers for points without an id."""
@@ -238,6 +247,7 @@ class Hypothesis:
     visibility: Visibility  # the view of a sensor that gives no ids
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
     cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
+    apart: frozenset[tuple[int, int]] = frozenset()  # ids that are two landmarks in any case
 
     @classmethod
     def of(cls, state: State) -> Hypothesis:
@@ -246,7 +256,7 @@ class Hypothesis:
 
     def with_state(self, state: State) -> Hypothesis:
         """Return another hypothesis, which has had the same landmarks in view."""
-        return Hypothesis(state, self.visibility.copy(), copy(self.index), self.cost)
+        return Hypothesis(state, self.visibility.copy(), copy(self.index), self.cost, self.apart)
 
     def copy(self) -> Hypothesis:
         """Return an independent copy."""

@@ -16,7 +16,9 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking.assignments import find_assignments
+from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.tracking.hypothesis import LandmarkIndex
+from slam_observer_ros.tracking.joint_compatibility import PRUNING_COST
 from slam_observer_ros.tracking.state import State
 
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
@@ -100,7 +102,9 @@ def test_points_are_held_back_from_many_old_landmarks_while_new_ones_can_decide_
     state, true_pose = after_a_loop(points, np.arange(new))
     body = se3.transform(se3.inverse(true_pose), points[10:14])
     event = ObservationEvent(LOOP_NS + 10**8, np.full(4, UNKNOWN_ID), body)
-    found = find_assignments(state, LandmarkIndex(), event, 20.0, np.inf, is_alone=True)
+    found = find_assignments(
+        state, LandmarkIndex(), event, np.full(4, 20.0), np.inf, is_alone=True
+    )
     taken = {row for assignment in found for row in assignment.rows.tolist()}
     assert (max(taken & set(range(16)), default=-1) < 0) == (new >= 5)
 
@@ -120,10 +124,28 @@ def twins(apart_m):
     return state
 
 
+def after_a_search(state, closure):
+    """All that is followed after a search of the map for landmarks that are one."""
+    hypotheses = Hypotheses(state)
+    hypotheses.fork(closure.twins)
+    return hypotheses
+
+
+def test_landmarks_that_may_be_one_are_followed_as_one_and_as_two():
+    """Then later views decide; what was asked once is not asked again."""
+    state, closure = twins(0.07), LoopClosure()
+    hypotheses = after_a_search(state, closure)
+    assert [len(one.state.landmarks) for one in hypotheses._all] == [17, 18]
+    assert 0.0 < hypotheses._all[1].cost < PRUNING_COST
+    hypotheses.fork(closure.twins)
+    assert [len(one.state.landmarks) for one in hypotheses._all] == [17, 18]
+
+
 @pytest.mark.parametrize(('apart_m', 'merged'), [(0.02, 1), (0.3, 0)])
 def test_two_landmarks_are_one_if_they_are_as_near_each_other_as_they_are_known(apart_m, merged):
     state = twins(apart_m)
-    assert LoopClosure().merge_twins(state) == merged
+    after_a_search(state, LoopClosure())
+    assert state.counts['merged_landmark'] == merged
     assert len(state.landmarks) == len(state.observer.points) == 18 - merged
     if merged:
         assert_allclose(state.observer.points[16], [15.01, 15.0, 0.0], atol=2e-3)
@@ -136,7 +158,8 @@ def test_two_landmarks_that_were_seen_at_once_side_by_side_are_two():
     state.landmarks.last_seen_ns[-2:] = 7
     closure.note(state, 7)
     state.landmarks.last_seen_ns[-1] = 9
-    assert closure.merge_twins(state) == 0
+    after_a_search(state, closure)
+    assert state.counts['merged_landmark'] == 0
 
 
 def test_a_false_point_beside_a_landmark_makes_it_no_two():
@@ -146,7 +169,8 @@ def test_a_false_point_beside_a_landmark_makes_it_no_two():
     state.landmarks.last_seen_ns[-2:] = 7
     closure.note(state, 7)
     state.landmarks.last_seen_ns[-1] = 9
-    assert closure.merge_twins(state) == 1
+    after_a_search(state, closure)
+    assert state.counts['merged_landmark'] == 1
 
 
 def test_after_a_merger_all_that_was_seen_of_both_is_smoothed_as_of_one():
@@ -178,8 +202,8 @@ def test_that_a_loop_has_closed_is_logged(caplog):
     state, _ = after_a_loop(points_in_a_hall(0), np.arange(3, 10))
     estimator._hypotheses.reset(state)
     caplog.set_level('INFO', logger='slam_observer_ros')
-    estimator._loop_closure.follow(estimator._state, LOOP_NS + 10**9, is_alone=True)
+    estimator._find_doubled(LOOP_NS + 10**9)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line == 'A loop has closed: 7 landmarks without ids were seen before.'
-    estimator._loop_closure.follow(estimator._state, LOOP_NS + 2 * 10**9, is_alone=True)
+    estimator._find_doubled(LOOP_NS + 2 * 10**9)
     assert len(caplog.records) == 1
