@@ -76,6 +76,10 @@ Points are noisy, and without it each exact one at the sensor's full range would
 """
 
 
+LEAST_VIEW = 0.1
+"""Least share of all directions that a sensor sees: the hull of few points is far too small."""
+
+
 class FieldOfView:
     """The convex hull, in the body frame, of the base and of all points that were ever seen.
 
@@ -88,7 +92,7 @@ class FieldOfView:
     def __init__(self, k: int) -> None:
         self.corners = np.zeros((1, k))  # (q, k) the base and points that span the hull, metres
         self._faces: FloatArray = np.empty((0, k + 1))
-        self.volume = 0.0  # of its inside, m^k
+        self.volume = 0.0  # in which the sensor sees, m^k; 0 while nobody knows
         self._margin_m = 0.0
 
     @property
@@ -111,7 +115,9 @@ class FieldOfView:
             self.corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
             return
         self.corners, self._faces = corners[hull.vertices], hull.equations
-        self.volume = float(hull.volume)
+        reach_m = np.linalg.norm(self.corners, axis=1).max()
+        ball = (math.pi if k == 2 else 4.0 / 3.0 * math.pi) * reach_m**k
+        self.volume = max(float(hull.volume), LEAST_VIEW * ball)
         self._margin_m = HULL_MARGIN * float(np.ptp(self.corners, axis=0).max())
 
     def contains(self, points: FloatArray) -> BoolArray:

@@ -192,7 +192,7 @@ def test_all_hypotheses_follow_a_change():
     either = np.array([UNKNOWN_ID]), np.array([[2.0, 0.0, 0.0]])
     estimator.add(ObservationEvent(after_blind_stretch_ns, *either))
     estimator.flush()
-    assert len(estimator._hypotheses) == 2
+    assert len(estimator._hypotheses) > 1
     estimator.change_settings(replace(settings, huber_threshold=0.5, rejection_threshold=3.0))
     for hypothesis in estimator._hypotheses._all:
         state = hypothesis.state
