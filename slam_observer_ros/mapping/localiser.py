@@ -447,6 +447,12 @@ class Contradiction:
         return self.lasts and not lasted
 
 
+FAMILIAR = 5
+"""Sightings from which on a landmark without an id explains a point, if the map has not had it: one
+that a carried robot adds must not at once.
+"""
+
+
 class Unexplained:
     """A cumulative sum of what observations say of a robot that was carried (E. S. Page, 1954)."""
 
@@ -463,6 +469,7 @@ class Unexplained:
             return False
         landmarks = state.landmarks
         is_seen = (landmarks.last_seen_ns == event.stamp_ns) & ~landmarks.tentative
+        is_seen &= (landmarks.born_ns < 0) | (landmarks.counts >= FAMILIAR)
         explained = int(np.count_nonzero(is_seen))
         missing: float = max(0, len(event.ids) - explained)
         if state.is_mapping:
