@@ -448,8 +448,8 @@ class Contradiction:
 
 
 FAMILIAR = 5
-"""Sightings from which on a landmark without an id explains a point, if the map has not had it: one
-that a carried robot adds must not at once.
+"""Sightings from which on a landmark without an id explains a point, if the map has not had it:
+one that a carried robot adds must not at once.
 """
 
 
