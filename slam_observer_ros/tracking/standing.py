@@ -548,11 +548,13 @@ class Drift:
             # No view of one landmark says more than a few: it may be an outlier.
             far = mahalanobis(r, noise + C @ P @ transpose(C))
             r = np.minimum(1.0, CLEAR / np.maximum(far, CLEAR))[:, None] * r
-            CW = transpose(C) @ np.linalg.inv(noise)
+            CW = transpose(solve_symmetric(noise, C))
             h = np.sum(CW @ C, axis=0)
             H, V, g = H + h, V + h, g + np.sum(CW @ r[:, :, None], axis=0)[:, 0]
         self._g, self._H, self._V = g, H, V
         S = H @ P @ H + V
+        if not np.isfinite(S).all():
+            return False
         # Along directions that no view has shown, both are zero.
         scale = np.sqrt(np.maximum(np.diagonal(S), np.finfo(np.float64).tiny))
         scaled = g / scale

@@ -177,6 +177,17 @@ def test_a_robot_is_not_surely_elsewhere_for_longer_than_a_second(odometry, true
     assert np.linalg.norm(robot.estimator.pose[:3, 3] - robot.A[:3, 3]) < 0.1
 
 
+@pytest.mark.parametrize('size', [1e-300, 1e-12, 1.0, 1e12])
+def test_a_map_known_in_one_direction_only_ends_no_run(size):
+    robot = Robot('uncertain')
+    along = np.array([0.6, 0.64, 0.48])
+    covariances = np.tile(size * np.outer(along, along), (4, 1, 1))
+    known = LandmarkMap(np.arange(4), POINTS, covariances, np.zeros(4, dtype=np.int64))
+    robot.estimator.load_map(known, np.eye(4), 1e-4 * np.eye(6))
+    robot.run(1.0, [0, 1, 2])
+    assert np.isfinite(robot.estimator.pose_covariance).all()
+
+
 @pytest.mark.parametrize('tags', [False, True], ids=['points', 'tags'])
 def test_a_robot_that_goes_as_its_wheels_say_does_not_slip(tags):
     robot = Robot(tags=tags)
