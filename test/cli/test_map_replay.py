@@ -203,7 +203,9 @@ class TestPoseInMapNotKnown:
     def test_a_place_never_found_leaves_nothing_but_the_reason(
         self, slam_observer, tmp_path, saved, more
     ):
-        other = record(tmp_path / 'other.mcap', np.eye(4), 2, lambda step: 100, steps=20)
+        other = record(
+            tmp_path / 'other.mcap', np.eye(4), 2, lambda s: 100, scale=lambda s: 1.5, steps=20
+        )
         poses, page, before = tmp_path / 'poses.tum', tmp_path / 'run.html', saved.read_bytes()
         error = slam_observer.fail(
             'replay', other, '--load-map', saved, '--map', saved, '--tum', poses, '--force',
