@@ -3,8 +3,8 @@
 k half measurements and the way between them are one point, seen now, with a covariance: by
 generalised least squares from starts all around, where the noise of the way is a random walk
 between the views. Two minima that both fit, as on both sides of a straight way, are left open
-until a curve decides. Where the past is kept, all that is known since says whether the place is
-sure, and the views take the place of the point once it has entered.
+until a curve decides. Where the past is kept, all that is known since has to
+agree that the place is sure, and the views take the place of the point once it has entered.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FURTHEST_RAD = 0.7
 MOST_TURN_RAD = 0.3
 """Standard deviation of a turn up to which the way since a view is known well: it is linear."""
 
-SURE_RANGES, SURE_BEARINGS = 0.05, 0.25
+SURE_RANGES, SURE_BEARINGS = 0.05, 0.1
 """Largest standard deviation of a point, as a share of its distance, that is linear enough."""
 
 FITS, APART = 2.5, 30.0
@@ -243,11 +243,13 @@ class WaitingRoom:
             if problem.side_is_open:
                 self.open_sides.add(landmark_id)
             return None
-        # All that is known since of where the robot was says more than odometry alone.
+        # All that is known since of where the robot was says more than odometry alone. But of
+        # directions it is too near the robot, and too sure, while the distance is open.
         earlier = [each for each in views if each.number < self._observations]
-        start = problem.nearer(found[0])
-        place = state.relinearisation.placed(start, _as_seen(state, earlier)) or found
-        if not _is_sure(state, view, place):
+        again = state.relinearisation.placed(found[0], _as_seen(state, earlier))
+        place = found if again is None else again
+        are_sure = [_is_sure(state, view, each) for each in (place, found)]
+        if not (are_sure[0] and (view.is_range or are_sure[1])):
             return None
         point, of_point = place[0], found[1]
         self._entered[landmark_id] = list(views)
@@ -370,18 +372,6 @@ class _PlaceProblem:
         covariance = np.zeros((3, 3))
         covariance[: self._k, : self._k] = C
         return p, covariance
-
-    def nearer(self, p: FloatArray) -> FloatArray:
-        """Return a point on the way to p (3,), no further off than the views lie apart.
-
-        A direction is nearly linear in 1/distance: from further off steps lead beyond the robot.
-        """
-        if self._is_range.any():
-            return p
-        off = p - self._origins[-1]
-        apart_m = float(np.linalg.norm(np.ptp(self._origins, axis=0)))
-        nearer: FloatArray = self._origins[-1] + off * min(apart_m / np.linalg.norm(off), 1.0)
-        return nearer
 
     def _starts(self) -> list[FloatArray]:
         origin = self._origins[-1]
