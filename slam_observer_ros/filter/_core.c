@@ -133,11 +133,11 @@ static int read_estimate(Door *door, PyObject *tuple, FilterState *x) {
     x->c = (long)door->sizes['c'], x->c_v = (long)door->sizes['v'];
     door->sizes['p'] = x->p;
     if (x->room > MAX_ROOM || x->n > MAX_ROOM || x->c > MAX_ROOM || x->c_v > x->c
-        || x->first < x->p + x->c || x->first > x->room || x->stride < x->k
+        || x->first < x->p + x->c || x->first > x->room || (x->stride != 0 && x->stride < x->k)
         || x->stride > MAX_ROOM || x->N != x->first + x->stride * x->n
-        || x->N > x->room || !are_within(x->estimated, x->c_v, DELAY))
+        || x->N > x->room || !are_within(x->estimated, x->c_v, 0, DELAY))
         return refuse("FilterState");
-    door->sizes['f'] = (Py_ssize_t)x->first;
+    door->sizes['N'] = (Py_ssize_t)x->N;
     return 1;
 }
 
@@ -186,19 +186,21 @@ typedef struct {
     const double *arms, *origins, *covariances, *sensor;
     const i64 *of_sensor;
     i64 column;
+    const double *D;
     long m, c_s;
 } Seen;
 
 static int read_seen(Door *door, PyObject *tuple, const FilterState *x, Seen *seen) {
-    static const char *const specs[] = {"i", "xm", "dm3", "~dm3", "~dm33", "~d7", "xs", "i", NULL};
+    static const char *const specs[] = {"i",     "xm", "dm3", "~dm3",  "~dm33",
+                                        "~d7", "xs", "i",   "~dm3c", NULL};
     if (!read_fields(door, tuple, specs, seen, "Seen"))
         return 0;
     seen->m = (long)door->sizes['m'];
     seen->c_s = seen->sensor == NULL ? 0 : (long)door->sizes['s'];
     door->sizes['o'] = seen->covariances == NULL ? 0 : seen->m;
     return (seen->column >= 0 && seen->column <= x->c && seen->c_s <= x->c - seen->column
-            && are_within(seen->of_sensor, seen->c_s, 6)
-            && are_within(seen->rows, seen->m, x->n - 1))
+            && are_within(seen->of_sensor, seen->c_s, 0, 6)
+            && are_within(seen->rows, seen->m, -1, x->n - 1))
            || refuse("Seen");
 }
 
@@ -210,10 +212,10 @@ static const char *const POINT_FIGURES[] = {"f", "f", "f", "f", "f", NULL};
 
 typedef struct {
     double gate, huber, error_time_s;
-    i64 confirmations, max_rejections;
+    i64 confirmations, max_rejections, may_refuse;
 } Limits;
 
-static const char *const LIMITS[] = {"f", "f", "f", "i", "i", NULL};
+static const char *const LIMITS[] = {"f", "f", "f", "i", "i", "i", NULL};
 
 typedef struct {
     const double *shares;
@@ -225,20 +227,18 @@ static const char *const FACTORS[] = {"d2pp", "D2", "D22", "D2", "f", NULL};
 
 typedef struct {
     double *A, *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *moved;
-    double *judged, *expected;
-    int judges, says_expected;
+    double *judged;
+    int judges;
 } Observed;
 
-static int read_observed(Door *door, PyObject *tuple, const FilterState *x, Observed *out) {
+static int read_observed(Door *door, PyObject *tuple, Observed *out) {
     static const char *const specs[] = {"D44", "Dm3", "Dm3", "Dm", "Dm3", "Dm3",
-                                        "Do33", "Dm", "Df", "Dj", "De", NULL};
+                                        "Do33", "Dm", "DN", "Dj", NULL};
     if (!read_fields(door, tuple, specs, out, "Observed"))
         return 0;
-    Py_ssize_t judged = door->sizes['j'], expected = door->sizes['e'], m = door->sizes['m'];
-    out->judges = judged > 0, out->says_expected = expected > 0;
-    return ((judged == 0 || judged == 3 * m + 1)
-            && (expected == 0 || expected == m * (m + 1) * x->k * x->k))
-           || refuse("Observed");
+    Py_ssize_t judged = door->sizes['j'];
+    out->judges = judged > 0;
+    return judged == 0 || judged == 3 * door->sizes['m'] + 1 || refuse("Observed");
 }
 
 /* ---------------------------------------------------------------------------- a motion: (27) */
@@ -558,7 +558,7 @@ static void spread(const FilterState *x, const double *noise, const double *F, d
     memset(J, 0, (size_t)(2 * p * N) * sizeof(double));
     for (int s = 0; s < p; s++)
         J[s * N + s] = 1.0;
-    for (long i = 0; i < x->n; i++) {
+    for (long i = 0; i < x->n && x->stride; i++) { /* an exact map has no errors */
         double y[3], K[9];
         for (int b = 0; b < 3; b++)
             y[b] = x->y_ref[3 * i + b] + x->a[3 * i + b];
@@ -653,12 +653,12 @@ static int advance(const FilterState *x, const Velocities *v, const Interval *in
 
 /* --------------------------------------------------------------- an observation: (28) to (31) */
 
-/* What m points say against the state, in the reference frame, on k axes: M = m k, q = p + c. */
+/* What m known landmarks say against the state, reference frame, k axes: M = m k, q = p + c. */
 typedef struct {
     long m, M, q;
     int k, has_sensor;
-    const i64 *rows;         /* (m) which landmarks are seen */
-    double *points, *stated; /* (m, 3) estimated; (m, 3, 3) covariances as stated, body frame */
+    i64 *rows, *at;          /* (m) which landmarks are seen, and by which of the points */
+    double *points, *stated; /* (m, 3) estimated; of all points covariances as stated, body frame */
     double *r, *R;           /* (M); (m, k, k) */
     double *D;               /* (M, c) how r changes with the calibration */
     double *repeated;        /* (m) by how much R grows, as errors last */
@@ -670,13 +670,13 @@ typedef struct {
 } Residuals;
 
 /* Lay the arrays of residuals out in one piece of memory, or count how many numbers they take. */
-static size_t lay_out(Residuals *res, const FilterState *x, long m, double *memory) {
+static size_t lay_out(Residuals *res, const FilterState *x, long m, long of_all, double *memory) {
     size_t k = (size_t)x->k, n = (size_t)m, M = n * k, c = (size_t)x->c;
     size_t q = (size_t)x->p + c;
     size_t used = 0;
     res->m = m, res->M = (long)M, res->q = (long)q, res->k = x->k;
 #define TAKE(field, count) (res->field = memory ? memory + used : NULL, used += (count))
-    TAKE(points, 3 * n), TAKE(stated, 9 * n), TAKE(r, M), TAKE(R, M * k), TAKE(D, M * c);
+    TAKE(points, 3 * n), TAKE(stated, 9 * (size_t)of_all), TAKE(r, M), TAKE(R, M * k), TAKE(D, M * c);
     TAKE(repeated, n), TAKE(predicted, M * M), TAKE(S, M * M), TAKE(L, M * M), TAKE(z, M);
     TAKE(S_inv_r, M), TAKE(C, M * q), TAKE(T, M * q), TAKE(half, q), TAKE(W, M * (size_t)x->N);
     TAKE(dx, (size_t)x->N), TAKE(weights, n);
@@ -788,30 +788,38 @@ static double repetition_factor(double dt_s, double error_time_s) {
     return (2.0 - fresh) / fresh;
 }
 
-/* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a landmark is in doubt. */
+/* Whether a landmark, with further rejections, is surer than a point seen. */
+static int is_sure(const Landmarks *table, i64 row, i64 further, const Limits *limits) {
+    i64 count = table->counts[row], needed = limits->max_rejections;
+    needed = count < needed ? count + 1 : needed;
+    return count >= limits->confirmations && table->rejections[row] < needed - further;
+}
+
+/* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a stamp is none. */
 static int fill_residuals(const FilterState *x, const Landmarks *table, const Seen *seen,
                           const PointFigures *figures, const Limits *limits, const Observed *out,
                           Residuals *res) {
     Pose pose = pose_of(x->A);
     double turned[9] = {0.0}, J[9] = {0.0};
     int k = x->k;
-    res->rows = seen->rows;
-    res->has_sensor = seen->sensor != NULL && seen->c_s > 0;
+    long i = 0;
+    res->has_sensor = (seen->sensor != NULL && seen->c_s > 0) || seen->D != NULL;
     if (seen->sensor != NULL) {
         exp_and_jacobian(seen->sensor, turned, J);
-        for (int i = 0; i < 9; i++)
-            turned[i] *= exp(seen->sensor[6]);
+        for (int e = 0; e < 9; e++)
+            turned[e] *= exp(seen->sensor[6]);
     }
-    for (long i = 0; i < seen->m; i++) {
-        i64 row = seen->rows[i];
+    for (long j = 0; j < seen->m; j++) {
+        i64 row = seen->rows[j];
+        double *y = out->points + 3 * j, *r = out->r + 3 * j, *origin = out->origins + 3 * j;
+        double *stated = res->stated + 9 * j, from_robot[3], expected[3], arm[3], line[3], C[9];
+        calibrated_point(seen, j, turned, x->is_planar, y, origin, stated);
+        out->weights[j] = 0.0, out->dt_s[j] = INFINITY;
+        memset(r, 0, 3 * sizeof(double));
+        if (row < 0)
+            continue;
         if (!is_stamp(table->last_seen_ns[row]) || !is_stamp(table->seen_before_ns[row]))
             return 0;
-        i64 count = table->counts[row], needed = limits->max_rejections;
-        if (table->rejections[row] >= (count < needed ? count + 1 : needed))
-            return 0;
-        double *y = out->points + 3 * i, *r = out->r + 3 * i, *origin = out->origins + 3 * i;
-        double *stated = res->stated + 9 * i, from_robot[3], expected[3], arm[3], line[3], C[9];
-        calibrated_point(seen, i, turned, x->is_planar, y, origin, stated);
         turn(pose.R, y, r);
         for (int b = 0; b < 3; b++) {
             double point = x->y_ref[3 * row + b] + x->a[3 * row + b];
@@ -825,7 +833,7 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
             arm[b] = y[b] - origin[b];
             expected[b] -= origin[b];
         }
-        const double *towards = count >= limits->confirmations ? expected : arm;
+        const double *towards = is_sure(table, row, 0, limits) ? expected : arm;
         double measured = larger(dot3(arm, arm), RESOLUTION_M * RESOLUTION_M);
         double stretch = sqrt(dot3(towards, towards) / measured);
         for (int b = 0; b < 3; b++)
@@ -841,16 +849,25 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
             for (int t = 0; t < k; t++)
                 res->R[k * k * i + k * b + t] = in_reference[3 * b + t];
         }
-        if (res->has_sensor)
+        if (seen->sensor != NULL && seen->c_s > 0)
             fill_sensitivity(x, seen, pose.R, J, expected, res->D + k * x->c * i);
-        out->dt_s[i] = unseen_s(table, row, seen->stamp_ns);
-        res->repeated[i] = repetition_factor(out->dt_s[i], limits->error_time_s);
+        else if (seen->D != NULL)
+            memcpy(res->D + k * x->c * i, seen->D + 3 * x->c * j,
+                   (size_t)(k * x->c) * sizeof(double));
+        out->dt_s[j] = unseen_s(table, row, seen->stamp_ns);
+        res->repeated[i] = repetition_factor(out->dt_s[j], limits->error_time_s);
+        res->rows[i] = row, res->at[i++] = j;
     }
     return 1;
 }
 
-static long column_of(const FilterState *x, const Residuals *res, long entry) {
-    return x->first + x->k * (long)res->rows[entry / x->k] + entry % x->k;
+static const double *of_landmark(const FilterState *x, const Residuals *res, long entry) {
+    long column = x->first + x->stride * (long)res->rows[entry / x->k] + entry % x->k;
+    return x->P + column * x->room; /* by symmetry, its column as well */
+}
+
+static double at_landmark(const FilterState *x, const Residuals *res, const double *row, long j) {
+    return row[x->first + x->stride * (long)res->rows[j / x->k] + j % x->k];
 }
 
 static void with_noise(const Residuals *res, const double *predicted, const double *factors,
@@ -865,32 +882,40 @@ static void with_noise(const Residuals *res, const double *predicted, const doub
     }
 }
 
-/* predicted = C P C' of r_i = C_i (eps, c) - xi_i, with C in the middle between the landmark and
- * the point seen: turning moves at right angles to it. */
-static void fill_predicted(const FilterState *x, const Observed *out, Residuals *res) {
-    long M = res->M, q = res->q;
+/* C of r_i = C_i (eps, c) - xi_i, ``chord`` of the way from the landmark to the point seen. In an
+ * exact map xi_i = [y_i]x eps_turn, which is a part of C_i then. */
+static void fill_output(const FilterState *x, double chord, Residuals *res) {
+    int k = res->k;
+    memset(res->C, 0, (size_t)(res->M * res->q) * sizeof(double));
     for (long i = 0; i < res->m; i++) {
-        double middle[3], *C = res->C + res->k * i * q;
+        double from[3] = {0.0}, *C = res->C + k * i * res->q;
         for (int b = 0; b < 3; b++)
-            middle[b] = 0.5 * out->r[3 * i + b];
-        memset(C, 0, (size_t)(res->k * q) * sizeof(double));
-        output_matrix(middle, x->p, C, q);
-        for (int b = 0; b < res->k && res->has_sensor; b++)
-            memcpy(C + b * q + x->p, res->D + (res->k * i + b) * x->c,
+            from[b] = (b < k ? chord * res->r[k * i + b] : 0.0)
+                      + (x->stride ? 0.0 : res->points[3 * i + b]);
+        output_matrix(from, x->p, C, res->q);
+        for (int b = 0; b < k && res->has_sensor; b++)
+            memcpy(C + b * res->q + x->p, res->D + (k * i + b) * x->c,
                    (size_t)x->c * sizeof(double));
     }
+}
+
+/* predicted = C P C', with C in the middle between the landmark and the point seen: turning moves
+ * at right angles to it. */
+static void fill_predicted(const FilterState *x, Residuals *res) {
+    long M = res->M, q = res->q;
+    fill_output(x, 0.5, res);
     for (long i = 0; i < M; i++) {
-        const double *C = res->C + i * q, *own = x->P + column_of(x, res, i) * x->room;
+        const double *C = res->C + i * q, *own = x->stride ? of_landmark(x, res, i) : NULL;
         double *half = res->half, *T = res->T + i * q;
-        memcpy(T, own, (size_t)q * sizeof(double));
         for (long t = 0; t < q; t++) {
+            T[t] = own ? own[t] : 0.0;
             half[t] = -T[t];
             for (long u = 0; u < q; u++)
                 half[t] += C[u] * x->P[u * x->room + t];
         }
         for (long j = 0; j <= i; j++) {
             const double *C_j = res->C + j * q, *T_j = res->T + j * q;
-            double sum = own[column_of(x, res, j)];
+            double sum = own ? at_landmark(x, res, own, j) : 0.0;
             for (long t = 0; t < q; t++)
                 sum += half[t] * C_j[t] - C[t] * T_j[t];
             res->predicted[i * M + j] = res->predicted[j * M + i] = sum;
@@ -898,48 +923,94 @@ static void fill_predicted(const FilterState *x, const Observed *out, Residuals 
     }
 }
 
-/* How far off each residual was, its density given those before it, shares; then all together. */
-static void write_judged(const Residuals *res, double *judged) {
-    long m = res->m, M = res->M;
-    int k = res->k;
-    for (long i = 0; i < m; i++) {
-        double block[9], sum = 0.0;
-        copy_block(res->S, M, i, k, block);
-        judged[i] = sqrt(larger(squared_distance(res->r + k * i, block, k), 0.0));
-        for (long e = k * i; e < k * (i + 1); e++)
-            sum += 0.5 * res->z[e] * res->z[e] + log(res->L[e * M + e]) + LOG_ROOT_2_PI;
-        judged[m + i] = -sum;
-        judged[2 * m + i] = 1.0 / res->repeated[i];
-    }
-    judged[3 * m] = sum_of_squares(res->z, M);
-}
-
-/* S = C P C' + R, factored; UNUSUAL where that fails, REJECTS where the weights say which points
- * are rejected. */
-static int judge(const FilterState *x, const Limits *limits, const Observed *out, Residuals *res) {
+/* L L' = S, z = L^-1 r and S^-1 r; 0 where S is indefinite. */
+static int solve(Residuals *res) {
     long M = res->M;
-    int k = res->k, status = DONE;
-    double gate = limits->gate, block[9];
-    fill_predicted(x, out, res);
-    with_noise(res, res->predicted, NULL, NULL, res->S);
     memcpy(res->L, res->S, (size_t)(M * M) * sizeof(double));
     if (!factor(res->L, M))
-        return UNUSUAL;
+        return 0;
     memcpy(res->z, res->r, (size_t)M * sizeof(double));
     solve_lower(res->L, M, res->z);
-    if (out->judges)
-        write_judged(res, out->judged);
     memcpy(res->S_inv_r, res->z, (size_t)M * sizeof(double));
     solve_upper(res->L, M, res->S_inv_r);
+    return 1;
+}
+
+/* S = C P C' + R, and which points pass the gate, weights 1; how many, or -1 where S is
+ * indefinite. */
+static long judge(const FilterState *x, const Seen *seen, double gate, const Observed *out,
+                  Residuals *res) {
+    long passed = res->m, of_all = seen->m;
+    int k = res->k;
+    fill_predicted(x, res);
+    with_noise(res, res->predicted, NULL, NULL, res->S);
+    if (!solve(res))
+        return -1;
     /* No residual is further out than all of them together are. */
-    if (sum_of_squares(res->z, M) > gate * gate)
-        for (long i = 0; i < res->m; i++) {
-            copy_block(res->S, M, i, k, block);
-            double square = squared_distance(res->r + k * i, block, k);
-            out->weights[i] = square >= 0.0 && sqrt(square) <= gate;
-            status = out->weights[i] == 0.0 ? REJECTS : status;
+    int all_pass = sum_of_squares(res->z, res->M) <= gate * gate;
+    for (long i = 0; i < res->m; i++)
+        out->weights[res->at[i]] = 1.0;
+    for (long i = 0; i < res->m && (!all_pass || out->judges); i++) {
+        double block[9];
+        copy_block(res->S, res->M, i, k, block);
+        double square = squared_distance(res->r + k * i, block, k);
+        if (out->judges) {
+            out->judged[res->at[i]] = sqrt(larger(square, 0.0));
+            out->judged[of_all + res->at[i]] = -INFINITY;
+            out->judged[2 * of_all + res->at[i]] = 1.0 / res->repeated[i];
         }
-    return status;
+        if (!all_pass && !(square >= 0.0 && sqrt(square) <= gate)) {
+            out->weights[res->at[i]] = 0.0;
+            passed--;
+        }
+    }
+    return passed;
+}
+
+/* Leave out the landmarks whose points have the weight 0. */
+static void select_passed(const FilterState *x, const Observed *out, Residuals *res) {
+    long used = 0, M = res->M, entries = 0;
+    int k = res->k;
+    for (long i = 0; i < M; i++) {
+        if (out->weights[res->at[i / k]] == 0.0)
+            continue;
+        long kept = 0; /* earlier entries are read before they are written over */
+        for (long j = 0; j < M; j++)
+            if (out->weights[res->at[j / k]] != 0.0) {
+                res->predicted[entries * M + kept] = res->predicted[i * M + j];
+                res->S[entries * M + kept++] = res->S[i * M + j];
+            }
+        entries++;
+    }
+    for (long i = 0; i < entries; i++) { /* rows of M entries become rows of so many */
+        memmove(res->predicted + i * entries, res->predicted + i * M,
+                (size_t)entries * sizeof(double));
+        memmove(res->S + i * entries, res->S + i * M, (size_t)entries * sizeof(double));
+    }
+    for (long i = 0; i < res->m; i++) {
+        if (out->weights[res->at[i]] == 0.0)
+            continue;
+        memmove(res->points + 3 * used, res->points + 3 * i, 3 * sizeof(double));
+        memmove(res->r + k * used, res->r + k * i, (size_t)k * sizeof(double));
+        memmove(res->R + k * k * used, res->R + k * k * i, (size_t)(k * k) * sizeof(double));
+        memmove(res->D + k * x->c * used, res->D + k * x->c * i,
+                (size_t)(k * x->c) * sizeof(double));
+        res->repeated[used] = res->repeated[i], res->rows[used] = res->rows[i];
+        res->at[used++] = res->at[i];
+    }
+    res->m = used, res->M = entries;
+}
+
+/* The density of each residual given those before it, and all together. */
+static void write_densities(const Residuals *res, long of_all, double *judged) {
+    int k = res->k;
+    for (long i = 0; i < res->m; i++) {
+        double sum = 0.0;
+        for (long e = k * i; e < k * (i + 1); e++)
+            sum += 0.5 * res->z[e] * res->z[e] + log(res->L[e * res->M + e]) + LOG_ROOT_2_PI;
+        judged[of_all + res->at[i]] = -sum;
+    }
+    judged[3 * of_all] = sum_of_squares(res->z, res->M);
 }
 
 /* g and F of motion_noise.py, from u = C' S^-1 r and G = C' S^-1 C. */
@@ -991,9 +1062,8 @@ static void step_factors(const Factors *factors, const double g[2], const double
 /* What these residuals say of the noise of the motion, by S as the likelihood at the logarithms
  * has it, which may be less than is applied; 0 if it is indefinite. ``work``: M (M + p + 1), and
  * ``at``: 2 M. */
-static int learn(const FilterState *x, const Factors *factors, double gate, const Observed *out,
-                 const Residuals *res, double *work, i64 *at, double logs[2],
-                 double information[4]) {
+static int learn(const FilterState *x, const Factors *factors, double gate, const Residuals *res,
+                 double *work, i64 *at, double logs[2], double information[4]) {
     int p = x->p, k = res->k;
     i64 *kept = at + res->M;
     double N[72], change[36] = {0.0}, u[6] = {0.0}, G[36] = {0.0}, g[2], F[4];
@@ -1012,7 +1082,8 @@ static int learn(const FilterState *x, const Factors *factors, double gate, cons
         for (long i = 0; i < M; i += k) { /* C in the middle between expected and seen */
             double middle[3];
             for (int b = 0; b < 3; b++)
-                middle[b] = res->points[3 * (at[i] / k) + b] + 0.5 * out->r[3 * (at[i] / k) + b];
+                middle[b] = res->points[3 * (at[i] / k) + b]
+                            + (b < k ? 0.5 * res->r[at[i] + b] : 0.0);
             output_matrix(middle, p, Y + i * p, p);
         }
         for (long i = 0; i < M; i++) {
@@ -1111,27 +1182,26 @@ static int loses_digits(const FilterState *x, const Residuals *res, const double
 /* (30), (31)  dx = -K r, K = P H' S^-1, and P - K H P; 0 if S is indefinite, or digits are lost.
  * H takes C at the landmark itself: so no observation says anything of the gauge. */
 static int correct(const FilterState *x, Residuals *res, double *L) {
-    long M = res->M, N = x->N, c = res->has_sensor ? x->c : 0;
-    const double *P = x->P;
+    long M = res->M, N = x->N, q = x->p + (res->has_sensor ? x->c : 0);
+    fill_output(x, 0.0, res);
     for (long i = 0; i < M; i++) { /* H P */
         double *row = res->W + i * N;
-        const double *of_shift = P + (x->turns + i % x->k) * x->room;
-        const double *of_landmark = P + column_of(x, res, i) * x->room;
+        const double *own = x->stride ? of_landmark(x, res, i) : NULL;
         for (long j = 0; j < N; j++)
-            row[j] = of_shift[j] - of_landmark[j];
-        for (long t = 0; t < c; t++) {
-            double share = res->D[i * x->c + t];
-            const double *of_c = P + (x->p + t) * x->room;
+            row[j] = own ? -own[j] : 0.0;
+        for (long t = 0; t < q; t++) {
+            double share = res->C[i * res->q + t];
+            const double *of_t = x->P + t * x->room;
             for (long j = 0; j < N && share != 0.0; j++)
-                row[j] += share * of_c[j];
+                row[j] += share * of_t[j];
         }
     }
     for (long i = 0; i < M; i++) /* H P H' */
         for (long j = 0; j < M; j++) {
-            const double *row = res->W + i * N;
-            double sum = row[x->turns + j % x->k] - row[column_of(x, res, j)];
-            for (long t = 0; t < c; t++)
-                sum += res->D[j * x->c + t] * row[x->p + t];
+            const double *row = res->W + i * N, *C = res->C + j * res->q;
+            double sum = x->stride ? -at_landmark(x, res, row, j) : 0.0;
+            for (long t = 0; t < q; t++)
+                sum += C[t] * row[t];
             res->predicted[i * M + j] = sum;
         }
     with_noise(res, res->predicted, res->repeated, res->weights, L);
@@ -1144,7 +1214,6 @@ static int correct(const FilterState *x, Residuals *res, double *L) {
     solve_lower_rows(L, M, res->W, N, N);
     if (loses_digits(x, res, L))
         return 0;
-    memset(res->dx, 0, (size_t)N * sizeof(double));
     for (long i = 0; i < M; i++)
         for (long j = 0; j < N; j++)
             res->dx[j] -= z[i] * res->W[i * N + j];
@@ -1165,83 +1234,96 @@ static void move(const FilterState *x, const double *dx, const Observed *out) {
     for (int b = 0; b < 3; b++)
         after.x[b] += shift[b];
     write_pose(&after, out->A);
-    for (long i = 0; i < x->n; i++) {
+    for (long i = 0; i < x->n && x->stride; i++) {
         const double *y_ref = x->y_ref + 3 * i;
         double *a = x->a + 3 * i, xi[3] = {0.0}, moved[3], turned[3], turned_a[3];
-        memcpy(xi, dx + x->first + x->k * i, (size_t)x->k * sizeof(double));
+        memcpy(xi, dx + x->first + x->stride * i, (size_t)x->k * sizeof(double));
         turn(J, xi, moved);
         turn(R_D, y_ref, turned);
         turn(R_D, a, turned_a);
         for (int b = 0; b < 3; b++)
             a[b] = turned_a[b] + (moved[b] + (turned[b] - y_ref[b]));
     }
-    memcpy(out->moved, dx, (size_t)x->first * sizeof(double));
+    memcpy(out->moved, dx, (size_t)x->N * sizeof(double));
 }
 
-/* Note that landmarks were seen, and where they should have been by the corrected state. */
+/* Note which landmarks were seen, and where they should have been by the corrected state. */
 static void record(const FilterState *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Observed *out,
                    const Residuals *res) {
     Pose pose = pose_of(out->A);
-    for (long i = 0; i < res->m; i++) {
-        i64 row = seen->rows[i];
-        table->counts[row] += 1;
-        table->rejections[row] = 0;
-        if (table->last_seen_ns[row] < seen->stamp_ns) {
+    for (long j = 0; j < seen->m; j++) {
+        i64 row = seen->rows[j], is_used = out->weights[j] > 0.0;
+        if (is_used) {
+            table->counts[row] += 1;
+            table->rejections[row] = 0;
+        }
+        if (is_used && table->last_seen_ns[row] < seen->stamp_ns) {
             table->seen_before_ns[row] = table->last_seen_ns[row];
             table->last_seen_ns[row] = seen->stamp_ns;
         }
-        double from_robot[3], expected[3], *line = out->lines_of_sight + 3 * i;
+        double from_robot[3], expected[3], *line = out->lines_of_sight + 3 * j;
+        memcpy(expected, out->points + 3 * j, sizeof expected);
+        if (row >= 0 && is_sure(table, row, !is_used, limits)) {
+            for (int b = 0; b < 3; b++)
+                from_robot[b] = x->y_ref[3 * row + b] + x->a[3 * row + b] - pose.x[b];
+            turn_back(pose.R, from_robot, expected);
+        }
         for (int b = 0; b < 3; b++)
-            from_robot[b] = x->y_ref[3 * row + b] + x->a[3 * row + b] - pose.x[b];
-        turn_back(pose.R, from_robot, expected);
-        const double *towards =
-            table->counts[row] >= limits->confirmations ? expected : out->points + 3 * i;
-        for (int b = 0; b < 3; b++)
-            line[b] = towards[b] - out->origins[3 * i + b];
+            line[b] = expected[b] - out->origins[3 * j + b];
         if (seen->covariances)
-            stated_covariance(out->points + 3 * i, res->stated + 9 * i, line, figures,
-                              out->covariances + 9 * i);
+            stated_covariance(out->points + 3 * j, res->stated + 9 * j, line, figures,
+                              out->covariances + 9 * j);
     }
 }
 
-/* Move X by the innovation (28)-(31), and P with it. */
+/* Move X by the innovation (28)-(31), and P with it, by all points that pass the gate. */
 static int observe(const FilterState *x, const Landmarks *table, const Seen *seen,
                    const PointFigures *figures, const Limits *limits, const Factors *factors,
                    const Observed *out) {
-    if (seen->m < 1 || !is_stamp(seen->stamp_ns)
-        || x->stride != x->k)
+    if (!is_stamp(seen->stamp_ns))
         return UNUSUAL;
+    long m = 0;
+    for (long j = 0; j < seen->m; j++)
+        m += seen->rows[j] >= 0;
     Residuals res;
-    size_t numbers = lay_out(&res, x, seen->m, NULL), M = (size_t)res.M;
+    size_t numbers = lay_out(&res, x, m, seen->m, NULL), M = (size_t)res.M;
     size_t work_size = M * (M + (size_t)x->p + 1);
-    double *memory = PyMem_Malloc((numbers + work_size + 2 * M) * sizeof(double));
+    double *memory = PyMem_Malloc((numbers + work_size + 2 * M + 2 * (size_t)m) * sizeof(double));
     if (memory == NULL)
         return UNUSUAL;
-    lay_out(&res, x, seen->m, memory);
+    lay_out(&res, x, m, seen->m, memory);
     double *work = memory + numbers, logs[2], information[4];
     i64 *at = (i64 *)(work + work_size); /* 8 bytes each, as numbers are */
+    res.rows = at + 2 * M, res.at = res.rows + m;
     int status = UNUSUAL;
-    if (fill_residuals(x, table, seen, figures, limits, out, &res))
-        status = judge(x, limits, out, &res);
-    if (status != UNUSUAL && factors->are_there
-        && !learn(x, factors, limits->gate, out, &res, work, at, logs, information))
-        status = UNUSUAL;
-    if (status == DONE && !(fill_weights(limits->huber, &res, work) && correct(x, &res, work)))
-        status = UNUSUAL;
-    for (int j = 0; j < 2 && status != UNUSUAL && factors->are_there; j++) {
-        factors->logs[j] = logs[j];
-        memcpy(factors->information + 2 * j, information + 2 * j, 2 * sizeof(double));
-        if (factors->least < INFINITY)
-            factors->applied[j] = exp(larger(logs[j], factors->least));
-    }
-    if (status == DONE) {
-        move(x, res.dx, out);
-        memcpy(out->weights, res.weights, (size_t)res.m * sizeof(double));
-        if (out->says_expected) {
-            memcpy(out->expected, res.S, M * M * sizeof(double));
-            memcpy(out->expected + M * M, res.R, M * (size_t)res.k * sizeof(double));
+    if (fill_residuals(x, table, seen, figures, limits, out, &res)) {
+        long passed = m ? judge(x, seen, limits->gate, out, &res) : 0;
+        status = passed < 0 ? UNUSUAL : limits->may_refuse && 2 * passed < m ? REJECTS : DONE;
+        if (status == DONE && m && factors->are_there
+            && !learn(x, factors, limits->gate, &res, work, at, logs, information))
+            status = UNUSUAL;
+        if (status == DONE && passed < m) {
+            select_passed(x, out, &res);
+            status = solve(&res) ? DONE : UNUSUAL;
         }
+        if (status == DONE && out->judges && res.m)
+            write_densities(&res, seen->m, out->judged);
+    }
+    memset(res.dx, 0, (size_t)x->N * sizeof(double));
+    if (status == DONE && res.m && !(fill_weights(limits->huber, &res, work)
+                                     && correct(x, &res, work)))
+        status = UNUSUAL;
+    if (status == DONE) {
+        for (int j = 0; j < 2 && m && factors->are_there; j++) {
+            factors->logs[j] = logs[j];
+            memcpy(factors->information + 2 * j, information + 2 * j, 2 * sizeof(double));
+            if (factors->least < INFINITY)
+                factors->applied[j] = exp(larger(logs[j], factors->least));
+        }
+        move(x, res.dx, out);
+        for (long i = 0; i < res.m; i++)
+            out->weights[res.at[i]] = res.weights[i];
         record(x, table, seen, figures, limits, out, &res);
     }
     PyMem_Free(memory);
@@ -1293,7 +1375,7 @@ static PyObject *py_observe(PyObject *Py_UNUSED(self), PyObject *const *args, Py
              && read_fields(&door, args[3], POINT_FIGURES, &figures, "PointFigures")
              && read_fields(&door, args[4], LIMITS, &limits, "Limits")
              && (!factors.are_there || read_fields(&door, args[5], FACTORS, &factors, "Factors"))
-             && read_observed(&door, args[6], &x, &out))
+             && read_observed(&door, args[6], &out))
         status = observe(&x, &table, &seen, &figures, &limits, &factors, &out);
     close_door(&door);
     return PyErr_Occurred() ? NULL : PyLong_FromLong(status);
@@ -1306,7 +1388,7 @@ static PyMethodDef methods[] = {
 };
 
 static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, .m_name = "_core", .m_doc = "The usual step in C.", .m_size = 0,
+    PyModuleDef_HEAD_INIT, .m_name = "_core", .m_doc = "The step in C.", .m_size = 0,
     .m_methods = methods,
 };
 

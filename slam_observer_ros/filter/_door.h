@@ -135,9 +135,9 @@ static inline PyObject *make_module(PyModuleDef *definition) {
     return module;
 }
 
-static inline int are_within(const i64 *numbers, Py_ssize_t count, i64 most) {
+static inline int are_within(const i64 *numbers, Py_ssize_t count, i64 least, i64 most) {
     for (Py_ssize_t j = 0; j < count; j++)
-        if (numbers[j] < 0 || numbers[j] > most)
+        if (numbers[j] < least || numbers[j] > most)
             return 0;
     return 1;
 }

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from typing import ClassVar, Protocol, TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg.blas import dsyr2k, dsyrk
+from scipy.linalg.blas import dsyr2k, dsyrk, dtrsm, dtrsv
+from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, LandmarkColumns
 from slam_observer_ros.filter.landmark_table import LandmarkTable
+from slam_observer_ros.lie.matrices import kalman_update, lifted, loses_digits
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -174,9 +176,12 @@ class SymmetricMatrix:
         """Return the entries (q, q) of the ``numbers`` (q,) of rows and columns."""
         return self._storage.take(numbers, axis=0).take(numbers, axis=1)
 
-    def subtract_square(self, W: FloatArray) -> None:
-        """Subtract Wᵀ W for W (q, N)."""
-        subtract_square(self._storage, self._size, self._widened(W))
+    def correct(
+        self, errors: IntArray, HP: FloatArray, S: FloatArray, r: FloatArray
+    ) -> FloatArray:
+        """As :func:`kalman_correction`, for H P (q, N); return K r (N,)."""
+        storage, wide = self._storage, self._widened(HP)
+        return kalman_correction(storage, self._size, errors, wide, S, r)[: self._size]
 
     def add_symmetric_product(self, A: FloatArray, B: FloatArray) -> None:
         """Add Aᵀ B + Bᵀ A for A and B (q, N)."""
@@ -201,6 +206,31 @@ def add_symmetric_product(M: FloatArray, size: int, A: FloatArray, B: FloatArray
     """Add Aᵀ B + Bᵀ A likewise, for A and B (q, room)."""
     dsyr2k(1.0, A.T, B.T, beta=1.0, c=M.T, lower=1, overwrite_c=1)
     _mirror(M, size)
+
+
+def kalman_correction(
+    M: FloatArray, size: int, errors: IntArray, HP: FloatArray, S: FloatArray, r: FloatArray
+) -> FloatArray:
+    """Return K r (room,), K = P Hᵀ S⁻¹, and let P become P − K H P, for H P (q, room).
+
+    ``errors`` are the columns of P, kept in ``M`` (room, room), that are entries of x.
+    """
+    before = M.diagonal()[errors]
+    L, is_indefinite = dpotrf(S, lower=1)
+    if is_indefinite:  # by rounding, where all but nothing was known
+        Kr: FloatArray = kalman_update(M, HP, S).dot(r)
+        is_lost = True
+    else:
+        # P − Wᵀ W and Wᵀ z, W = L⁻¹ H P, z = L⁻¹ r, L Lᵀ = S.
+        z = dtrsv(L, r, lower=1)
+        W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        is_lost = loses_digits(before, W[:, errors], L)
+        subtract_square(M, size, W)
+        Kr = z.dot(W)
+    if is_lost:  # rounding has left too little: make it a covariance again
+        at = np.ix_(errors, errors)
+        M[at] = lifted(M[at], before)
+    return Kr
 
 
 def _mirror(M: FloatArray, size: int) -> None:

@@ -1,4 +1,4 @@
-"""The usual step by the compiled core where it was built, and else by its reference in numpy."""
+"""The step by the compiled core where it was built, and else by its reference in numpy."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import os
 
 from slam_observer_ros.common.process import compiled, VARIABLE
 from slam_observer_ros.filter import step
+from slam_observer_ros.filter.flat_arrays import FilterState, Landmarks, Limits, Observed, Seen
+from slam_observer_ros.filter.robust import AT_ONCE
+from slam_observer_ros.models.motion_noise import Factors
+from slam_observer_ros.models.observation_noise import PointFigures
 
 COMPILED = compiled('filter._core')
 
@@ -20,4 +24,25 @@ def description() -> str:
 
 
 advance = step.advance if COMPILED is None else COMPILED.advance
-observe = step.observe if COMPILED is None else COMPILED.observe
+
+MOST_WORK = 1e7
+"""Multiplications of a correction of P beyond which numpy, with BLAS, takes less time."""
+
+
+def observe(
+    x: FilterState,
+    landmarks: Landmarks,
+    seen: Seen,
+    figures: PointFigures,
+    limits: Limits,
+    factors: Factors | None,
+    out: Observed,
+) -> int:
+    """As :func:`.step.observe`, by whichever of the two takes less time."""
+    arguments = x, landmarks, seen, figures, limits, factors, out
+    m = len(seen.rows)
+    if COMPILED is not None and m <= AT_ONCE and m * x.size**2 <= MOST_WORK / 3.0:
+        status: int = COMPILED.observe(*arguments)
+        if status != step.UNUSUAL:
+            return status
+    return step.observe(*arguments)

@@ -1,4 +1,4 @@
-"""Plain arrays and numbers that the usual step reads and writes: one layout in numpy and in C.
+"""Plain arrays and numbers that the step reads and writes: one layout in numpy and in C.
 
 Arrays are contiguous, of float64 or int64. Frames and units are as in :mod:`.observer`.
 """
@@ -11,7 +11,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 
 
 class FilterState(NamedTuple):
-    """X̂ and the covariance P of its errors (ε, c̃, ξ_1 … ξ_n), of a map at rest."""
+    """X̂ and the covariance P of its errors (ε, c̃, ξ_1 … ξ_n)."""
 
     A: FloatArray  # (4, 4) Â
     y_ref: FloatArray  # (n, 3) y_i° of the landmarks that P has
@@ -19,7 +19,7 @@ class FilterState(NamedTuple):
     P: FloatArray  # (room, room) whose first N rows and columns count, changed in place
     size: int  # N
     first: int  # the first column of the landmarks; between p + c and it are postponed ones
-    stride: int  # columns of a landmark, its point's first: more than k of a tag
+    stride: int  # columns of a landmark, its point's first; none, 0, in an exact map
     is_planar: bool  # whether p is 3 and k is 2, in place of 6 and 3
     rates: FloatArray  # (6, 7) [M b] of velocities M V + b
     estimated: IntArray  # (c_v,) entries of it, row by row, that c̃ begins with; 42 is the delay
@@ -61,13 +61,16 @@ class Seen(NamedTuple):
     """Points seen, body frame, and the sensor that saw them, if it is calibrated."""
 
     stamp_ns: int
-    rows: IntArray  # (m,) which landmarks they are of
+    rows: IntArray  # (m,) which landmarks they are of, −1 where a landmark is not known yet
     arms: FloatArray  # (m, 3) from the sensor to each point, metres
     origins: FloatArray | None  # (m, 3) where the sensor was, metres; None at the base
     covariances: FloatArray | None  # (m, 3, 3) as stated, m²; None where the figures have them
     sensor: FloatArray | None  # (7,) ψ, d and s of the sensor, rad and m
     of_sensor: IntArray  # (c_s,) which of ψ, d and s are estimated
     column: int  # of c̃ where they begin
+    # (m, 3, c) how points change with the calibration, reference frame; None where the sensor
+    # says that, or they don't
+    D: FloatArray | None
 
 
 class Limits(NamedTuple):
@@ -78,6 +81,7 @@ class Limits(NamedTuple):
     error_time_s: float  # correlation time of the errors of points
     confirmations: int  # observations that make a landmark sure
     max_rejections: int  # in a row, which make it doubtful
+    may_refuse: int  # whether nothing is to be changed where most points are rejected
 
 
 class Observed(NamedTuple):
@@ -86,15 +90,13 @@ class Observed(NamedTuple):
     A: FloatArray  # (4, 4) Â after it
     points: FloatArray  # (m, 3) where, by the calibration of the sensor, body frame
     r: FloatArray  # (m, 3) residuals (29)
-    weights: FloatArray  # (m,) Huber's, 0 for a rejected point
+    weights: FloatArray  # (m,) Huber's, 0 for a point that is rejected or of no known landmark
     origins: FloatArray  # (m, 3) where the sensor was, body frame
     lines_of_sight: FloatArray  # (m, 3) from the sensor to where each should be now
     # (m, 3, 3) of the points, body frame, m²; (0, 3, 3) where none were stated
     covariances: FloatArray
     dt_s: FloatArray  # (m,) since each was seen before; infinite if it was not
-    moved: FloatArray  # (first,) −K r of pose, calibration and postponed columns
+    moved: FloatArray  # (N,) −K r
     # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
-    # normalised innovation squared of all; empty where nobody asks
+    # normalised innovation squared of those used, zero at first; empty where nobody asks
     judged: FloatArray
-    # S (m k, m k) of the residuals, m², then R (m, k, k), the points' part of it; or empty
-    expected: FloatArray

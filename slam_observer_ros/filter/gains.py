@@ -170,10 +170,6 @@ class Gains(ABC):
         turned = observer.turned(covariances)
         return Residuals(rows, e, r, observer.a[rows], turned, dt_s, repeated, D)
 
-    @abstractmethod
-    def observe(self, residuals: Residuals) -> FloatArray:
-        """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
-
     # Landmarks and sensors
 
     def add(

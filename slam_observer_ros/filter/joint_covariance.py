@@ -7,12 +7,9 @@ The blocks C_i of all methods are of ε (m, k, p), or of (ε, c̃), the first en
 from __future__ import annotations
 
 from copy import copy
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg.blas import dtrsm, dtrsv
-from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.filter.arrays import FilterArrays, SymmetricMatrix
@@ -21,12 +18,8 @@ from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.lie.matrices import (
     block_diagonal,
-    kalman_update,
-    lifted,
-    loses_digits,
     mended,
     transpose,
-    with_blocks,
 )
 from slam_observer_ros.models.motion import Motion
 
@@ -156,10 +149,6 @@ class JointCovariance:
 
     # The step
 
-    def write_active(self, column: NDArray[Any], active: NDArray[Any]) -> None:
-        """Write what was read of a ``column`` at the landmarks in P, and changed, back to it."""
-        # All are in P: what was read is a view of the column.
-
     def note_motion(self) -> None:
         """Note that the robot has moved."""
 
@@ -230,17 +219,6 @@ class JointCovariance:
         PC = self.P[:q, :q].dot(C.T) - to_state.T
         return PC[: self._p], C.dot(PC) - to_state.dot(C.T) + seen.take(columns, axis=1)
 
-    def change_of_residuals(self, residuals: Residuals, x: FloatArray) -> FloatArray:
-        """Return H x (m, k), by which residuals change when the state is moved by exp(x)."""
-        C, columns = self.output_matrix(residuals), self._columns(residuals.rows)
-        change: FloatArray = C @ x[: C.shape[2]] - x[columns].reshape(len(C), -1)
-        return change
-
-    def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
-        """Return −K r of residuals r (m, k) of noise R (m, k, k), K = P Hᵀ S⁻¹, and update P."""
-        HP, HPH = self.project(C, rows)
-        return -self.update(HP, with_blocks(HPH, R), r.ravel())
-
     def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
         """Update P by what :meth:`project` projected, which is used up; return K r.
 
@@ -248,31 +226,12 @@ class JointCovariance:
         """
         if not len(r):
             return np.zeros(len(self.P))
-        errors = self._errors
-        before = self.P.diagonal()[errors]
-        L, is_indefinite = dpotrf(S, lower=1)
-        if is_indefinite:  # by rounding, where all but nothing was known
-            moved: FloatArray = kalman_update(self.P, HP, S).dot(r)
-            self._lift(errors, before)
-            return moved
-        # P − Wᵀ W and Wᵀ z, W = L⁻¹ H P, z = L⁻¹ r, L Lᵀ = S.
-        z = dtrsv(L, r, lower=1)
-        W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
-        self._matrix.subtract_square(W)
-        if loses_digits(before, W[:, errors], L):
-            self._lift(errors, before)
-        Kr: FloatArray = z.dot(W)
-        return Kr
+        return self._matrix.correct(self._errors, HP, S, r)
 
     @property
     def _errors(self) -> IntArray:
         """Columns of P that are entries of x, not of what is postponed."""
         return np.append(np.arange(self.chart.robot), np.arange(self.first, len(self.P)))
-
-    def _lift(self, errors: IntArray, before: FloatArray) -> None:
-        """Make P a covariance again after a correction of which rounding has left too little."""
-        at = np.ix_(errors, errors)
-        self.P[at] = lifted(self.P[at], before)
 
     # Landmarks
 

@@ -163,13 +163,6 @@ class Residuals:
         k = axes.point
         return self.r[:, :k], self.covariances[:, :k, :k]
 
-    def changed(self, change: FloatArray) -> Residuals:
-        """Return it with residuals that have changed by (m, k), for the same landmarks."""
-        e, r = self.e.copy(), self.r.copy()
-        e[:, : change.shape[1]] += change
-        r[:, : change.shape[1]] += change
-        return replace(self, e=e, r=r)
-
     def select(self, mask: BoolArray | slice) -> Residuals:
         """Return the part of it that ``mask`` (m,), or a slice, picks."""
         if isinstance(mask, np.ndarray) and np.count_nonzero(mask) == len(mask):

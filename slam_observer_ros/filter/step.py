@@ -1,11 +1,9 @@
-"""The usual step in numpy: the reference that ``_core.c`` repeats, equation by equation.
+"""The step in numpy: the reference that ``_core.c`` repeats, equation by equation.
 
-It takes a motion along velocities without a gap, and an observation whose points are all of known
-landmarks that are not doubtful. Anything else is UNUSUAL, and nothing is changed then: the
-filters' own methods go on from there, also where orientations of tags are seen. The caller leaves
-out points that are rejected, or of new landmarks.
-
-The errors are x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, and ω_i of tags: see :mod:`.chart`.
+A motion along velocities without a gap, and an observation of any points: of few or many known
+landmarks, of new ones, which it leaves out, and of an exact map. The errors are
+x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, and more of landmarks that turn or move: see
+:mod:`.chart`.
 """
 
 from __future__ import annotations
@@ -14,15 +12,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.blas import dtrsm, dtrsv
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg.blas import dtrsv
 
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.filter.arrays import (
-    add_symmetric_product,
-    subtract_square,
-)
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.filter.arrays import add_symmetric_product, kalman_correction
 from slam_observer_ros.filter.chart import slam_exp
 from slam_observer_ros.filter.flat_arrays import (
     Advanced,
@@ -33,30 +27,25 @@ from slam_observer_ros.filter.flat_arrays import (
     Observed,
     Seen,
 )
-from slam_observer_ros.filter.robust import (
-    accepted,
-    huber_weights,
-    REWEIGHTINGS,
-)
+from slam_observer_ros.filter.robust import accepted, AT_ONCE, huber_weights, REWEIGHTINGS
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import axes_of, EstimatedAxes
 from slam_observer_ros.lie.matrices import (
+    cholesky,
     diagonal_blocks,
-    loses_digits,
     mahalanobis,
+    solve_definite,
     with_blocks,
 )
 from slam_observer_ros.lie.sensor_mounting import sensitivity as sensor_sensitivity
 from slam_observer_ros.models.calibration import calibrated, with_moves
 from slam_observer_ros.models.motion_noise import (
     Factors,
+    learnt,
     motion_variances,
     MotionFigures,
     score,
     stated_motion_covariances,
-)
-from slam_observer_ros.models.motion_noise import (
-    learnt as learnt_factors,
 )
 from slam_observer_ros.models.observation_noise import (
     point_covariances,
@@ -70,8 +59,8 @@ from slam_observer_ros.models.velocity_history import Velocities
 UNUSUAL, AT_REST, DONE, REJECTS = -1, 0, 1, 2
 """What a step returns; AT_REST where the motion says nothing of the noise of velocities.
 
-REJECTS where the gate does not let all points pass: nothing is changed then, but weights say which
-ones it rejects, and what all of them show of the noise is learnt.
+UNUSUAL for a motion with a gap, and REJECTS where the gate lets less than half of the points pass,
+if that may be refused: nothing has changed then.
 """
 
 _PLANAR = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
@@ -121,8 +110,9 @@ def advance(
     P, of_c = x.P, slice(p, p + c)
     JT = np.zeros((p, len(P)))
     JT[:, :p] = np.eye(p)
-    of_landmarks = JT[:, x.first : x.size].reshape(p, -1, x.stride)
-    of_landmarks[:, :, : axes.point] = -axes.turn_matrix(x.y_ref + x.a).transpose(2, 0, 1)
+    if x.stride:  # an exact map has no errors
+        of_landmarks = JT[:, x.first : x.size].reshape(p, -1, x.stride)
+        of_landmarks[:, :, : axes.point] = -axes.turn_matrix(x.y_ref + x.a).transpose(2, 0, 1)
     half = (0.5 * (out.noise + F.dot(P[of_c, of_c]).dot(F.T))).dot(JT)
     if c:
         half += F.dot(P[of_c])
@@ -220,13 +210,13 @@ def _mean_about(
 
 
 class _Residuals(NamedTuple):
-    """What m points say against the state, in the reference frame, on k estimated axes."""
+    """What points of m known landmarks say against the state, reference frame, k axes."""
 
-    columns: IntArray  # (m k,) theirs in P
+    at: IntArray  # (m,) which of the points seen
+    columns: IntArray  # (m k,) theirs in P; none in an exact map
     points: FloatArray  # (m, 3) ŷ_i
     r: FloatArray  # (m, 3) r_i (29)
     R: FloatArray  # (m, k, k) covariances of the points seen
-    stated: FloatArray | None  # (m, 3, 3) the same in the body frame, where it was stated
     D: FloatArray | None  # (m, k, c) how r_i changes with the calibration; None if it does not
     repeated: FloatArray  # (m,) by how much R grows, as errors last
     axes: EstimatedAxes
@@ -237,20 +227,40 @@ class _Residuals(NamedTuple):
         return self.r[:, : self.axes.point].ravel()
 
     def output_matrix(self, chord: float) -> FloatArray:
-        """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, ``chord`` of the way from ŷ_i to y."""
-        C = self.axes.output_matrix(chord * self.r)
+        """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, ``chord`` of the way from ŷ_i to y.
+
+        In an exact map ξ_i = [ŷ_i]× ε_Ω, which is a part of C_i then.
+        """
+        origins = chord * self.r
+        C = self.axes.output_matrix(origins if len(self.columns) else self.points + origins)
         C = C if self.D is None else np.concatenate([C, self.D], axis=2)
-        return C.reshape(len(self.columns), -1)
+        return C.reshape(len(self.at) * self.axes.point, -1)
 
+    def changed(self, dx: FloatArray) -> _Residuals:
+        """Return them as they are after the state was moved by exp(dx), to first order."""
+        C = self.output_matrix(0.0)
+        change = C.dot(dx[: C.shape[1]])
+        if len(self.columns):
+            change -= dx[self.columns]
+        r = self.r.copy()
+        r[:, : self.axes.point] += change.reshape(len(r), -1)
+        return self._replace(r=r)
 
-class _Judged(NamedTuple):
-    """What P predicts of residuals, and how far they are off by that."""
-
-    predicted: FloatArray  # (m k, m k) C P Cᵀ
-    S: FloatArray  # (m k, m k) with the noise of the points
-    L: FloatArray  # (m k, m k) L Lᵀ = S
-    S_inv_r: FloatArray  # (m k,)
-    distances: FloatArray | None  # (m,) Mahalanobis distance of each; None if it does not matter
+    def select(self, wanted: BoolArray | slice) -> _Residuals:
+        """Return those of ``wanted`` (m,) landmarks."""
+        columns = self.columns
+        if len(columns):
+            columns = columns.reshape(len(self.at), -1)[wanted].ravel()
+        return _Residuals(
+            self.at[wanted],
+            columns,
+            self.points[wanted],
+            self.r[wanted],
+            self.R[wanted],
+            None if self.D is None else self.D[wanted],
+            self.repeated[wanted],
+            self.axes,
+        )
 
 
 def observe(
@@ -262,45 +272,44 @@ def observe(
     factors: Factors | None,
     out: Observed,
 ) -> int:
-    """Move X̂ by the innovation (28)–(31), and P with it.
+    """Move X̂ by the innovation (28)–(31), and P with it, by all points that pass the gate.
 
-    Without ``factors`` nothing is learnt of the noise of the motion.
+    Without ``factors`` nothing is learnt of the noise of the motion. Of many points, one block
+    after the other costs less than all at once, and leaves the same. The state moves only then:
+    all are linearised at the same point.
     """
-    if x.stride != axes_of(x.is_planar).point:
-        return UNUSUAL
-    residuals = _residuals(x, landmarks, seen, figures, limits, out)
-    judged = None if residuals is None else _judged(x, residuals, limits)
-    if residuals is None or judged is None:
-        return UNUSUAL
-    if len(out.judged):
-        _write_judged(residuals, judged, out.judged)
-    learnt = None if factors is None else _learnt(factors, residuals, judged.S, limits.gate)
-    if factors is not None and learnt is None:
-        return UNUSUAL
-    if judged.distances is not None and not accepted(judged.distances, limits.gate).all():
-        out.weights[:] = accepted(judged.distances, limits.gate)
-        _take_over(factors, learnt)
-        return REJECTS
-    weights = _weights(residuals, judged, limits)
-    dx = None if weights is None else _correct(x, residuals, weights)
-    if weights is None or dx is None:
-        return UNUSUAL
+    residuals, stated = _residuals(x, landmarks, seen, figures, limits, out)
+    dx, m = np.zeros(len(x.P)), len(residuals.at)
+    out.weights[:] = 0.0
+    for start in range(0, m, AT_ONCE):
+        block = residuals.select(slice(start, start + AT_ONCE))
+        block = block.changed(dx) if start else block
+        predicted, S = _predicted(x, block)
+        passed = _passed(block, S, limits.gate)
+        if limits.may_refuse and start == 0 and 2 * np.count_nonzero(passed) < len(passed):
+            return REJECTS
+        if factors is not None and start == 0:
+            _learn(factors, block, S, limits.gate)
+        weights = np.zeros(len(passed))
+        used = np.flatnonzero(np.repeat(passed, block.axes.point))
+        if len(out.judged):
+            _write_judged(block, S, passed, out.judged)
+        if len(used):
+            block = block.select(passed)
+            weights[passed] = _weights(block, predicted[np.ix_(used, used)], limits)
+            dx += _correct(x, block, weights[passed])
+        out.weights[residuals.at[start : start + AT_ONCE]] = weights
     # (28)  X̂ ← exp(−K r) · X̂:  Â ← exp(ε) Â,  ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i
-    axes = residuals.axes
-    X = slam_exp(axes.full_pose(dx[: axes.p]), axes.full_points(dx[x.first :]))
+    axes, parts = residuals.axes, dx[x.first : x.size].reshape(-1, max(x.stride, 1))
+    X = slam_exp(axes.full_pose(dx[: axes.p]), axes.full_points(parts[:, : axes.point]))
     R_D = X.A[:3, :3]
     out.A[:] = X.A.dot(x.A)
-    x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))
-    out.moved[:] = dx[: x.first]
-    out.weights[:] = weights
-    _take_over(factors, learnt)
-    if len(out.expected):
-        out.expected[:] = np.append(judged.S, residuals.R)
+    if x.stride:
+        x.a[:] = x.a.dot(R_D.T) + (X.a + (x.y_ref.dot(R_D.T) - x.y_ref))
+    out.moved[:] = dx[: x.size]
     _record(x, landmarks, seen, limits, out)
-    if residuals.stated is not None:
-        out.covariances[:] = stated_covariances(
-            out.points, residuals.stated, out.lines_of_sight, figures
-        )
+    if stated is not None:
+        out.covariances[:] = stated_covariances(out.points, stated, out.lines_of_sight, figures)
     return DONE
 
 
@@ -311,47 +320,56 @@ def _residuals(
     figures: PointFigures,
     limits: Limits,
     out: Observed,
-) -> _Residuals | None:
-    """Return the residuals (29); None where a landmark is doubtful."""
-    rows = seen.rows
-    counts, rejections = landmarks.counts.take(rows), landmarks.rejections.take(rows)
-    if np.count_nonzero(rejections >= np.minimum(counts + 1, limits.max_rejections)):
-        return None
+) -> tuple[_Residuals, FloatArray | None]:
+    """Return the residuals (29) of known landmarks, and what is stated of all points seen."""
     axes, R_hat, x_hat = axes_of(x.is_planar), x.A[:3, :3], x.A[:3, 3]
-    k = axes.point
-    y, origins, stated = _calibrated(seen, x.is_planar)
+    k, at = axes.point, np.flatnonzero(seen.rows >= 0)
+    out.points[:], out.origins[:], stated = _calibrated(seen, x.is_planar)
+    rows, y, origins = seen.rows[at], out.points[at], out.origins[at]
     points = x.y_ref.take(rows, axis=0) + x.a.take(rows, axis=0)
     # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     r = y.dot(R_hat.T) + x_hat - points
     # The noise at the range where a landmark should be, in the measured direction.
     expected = (points - x_hat).dot(R_hat)
-    is_sure = counts >= limits.confirmations
+    is_sure = _are_sure(landmarks, rows, 0, limits)
     ranges_2 = _squares(np.where(is_sure[:, None], expected, y) - origins)
     stretch = np.sqrt(ranges_2 / np.maximum(_squares(y - origins), RESOLUTION_M**2))
     towards = stretch[:, None] * (y - origins)
     covariances = (
         point_covariances(towards, figures)
         if stated is None
-        else stated_covariances(y, stated, towards, figures)
+        else stated_covariances(y, stated[at], towards, figures)
     )
     # How r_i changes with the sensor that saw the point.
-    D = None
+    D = None if seen.D is None else seen.D[at, :k]
     if seen.sensor is not None and len(seen.of_sensor):
         D = np.zeros((len(r), k, len(x.drift)))
         of_sensor = sensor_sensitivity(seen.sensor, expected - origins)[:, :, seen.of_sensor]
         D[:, :, seen.column : seen.column + len(seen.of_sensor)] = (R_hat @ of_sensor)[:, :k]
-    out.points[:], out.r[:], out.origins[:] = y, r, origins
-    out.dt_s[:] = dt_s = _unseen_s(landmarks, rows, seen.stamp_ns)
-    return _Residuals(
-        (x.first + np.arange(k) + k * rows[:, None]).ravel(),
+    out.r[:], out.dt_s[:] = 0.0, np.inf
+    out.r[at] = r
+    out.dt_s[at] = dt_s = _unseen_s(landmarks, rows, seen.stamp_ns)
+    columns = x.first + np.arange(k) + x.stride * rows[:, None]
+    residuals = _Residuals(
+        at,
+        columns.ravel() if x.stride else np.empty(0, dtype=np.int64),
         points,
         r,
         (R_hat @ covariances @ R_hat.T)[:, :k, :k],
-        stated,
         D,
         repetition_factors(dt_s, limits.error_time_s),
         axes,
     )
+    return residuals, stated
+
+
+def _are_sure(
+    landmarks: Landmarks, rows: IntArray, further: BoolArray | int, limits: Limits
+) -> BoolArray:
+    """Return which landmarks (m,) are surer than a point seen, with ``further`` rejections."""
+    counts, rejections = landmarks.counts.take(rows), landmarks.rejections.take(rows) + further
+    in_doubt = rejections >= np.minimum(counts + 1, limits.max_rejections)
+    return np.asarray((counts >= limits.confirmations) & ~in_doubt)
 
 
 def _calibrated(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
@@ -380,32 +398,34 @@ def _unseen_s(landmarks: Landmarks, rows: IntArray, stamp_ns: int) -> FloatArray
     return np.where(last_ns < 0, np.inf, to_s(stamp_ns - last_ns))
 
 
-def _judged(x: FilterState, residuals: _Residuals, limits: Limits) -> _Judged | None:
-    """Return S = C P Cᵀ + R, factored; None if it is indefinite.
+def _predicted(x: FilterState, residuals: _Residuals) -> tuple[FloatArray, FloatArray]:
+    """Return C P Cᵀ of the residuals, and S with the noise of the points, both (m k, m k).
 
     C is taken in the middle between ŷ_i and the point seen: turning moves at right angles to it.
     """
-    C, P, axes = residuals.output_matrix(0.5), x.P, residuals.axes
+    C, P, columns = residuals.output_matrix(0.5), x.P, residuals.columns
     q = C.shape[1]
-    seen_P = P.take(residuals.columns, axis=0)
-    to_state = seen_P[:, :q]
-    predicted = C.dot(P[:q, :q].dot(C.T) - to_state.T) - to_state.dot(C.T)
-    predicted += seen_P.take(residuals.columns, axis=1)
-    S = with_blocks(predicted, residuals.R)
-    L, is_indefinite = dpotrf(S, lower=1)
-    if is_indefinite:
-        return None
-    S_inv_r, distances = dpotrs(L, residuals.flat, lower=1)[0], None
+    if len(columns):
+        seen_P = P.take(columns, axis=0)
+        to_state = seen_P[:, :q]
+        predicted = C.dot(P[:q, :q].dot(C.T) - to_state.T) - to_state.dot(C.T)
+        predicted += seen_P.take(columns, axis=1)
+    else:
+        predicted = C.dot(P[:q, :q]).dot(C.T)
+    return predicted, with_blocks(predicted, residuals.R)
+
+
+def _passed(residuals: _Residuals, S: FloatArray, gate: float) -> BoolArray:
+    """Return which residuals (m,) pass the gate."""
+    r, k = residuals.flat, residuals.axes.point
     # No residual is further out than all of them together are.
-    if residuals.flat.dot(S_inv_r) > limits.gate**2:
-        distances = mahalanobis(residuals.r[:, : axes.point], diagonal_blocks(S, axes.point))
-    return _Judged(predicted, S, L, S_inv_r, distances)
+    if r.dot(solve_definite(S, r)) <= gate**2:
+        return np.ones(len(residuals.at), dtype=np.bool_)
+    return accepted(mahalanobis(r.reshape(-1, k), diagonal_blocks(S, k)), gate)
 
 
-def _learnt(
-    factors: Factors, residuals: _Residuals, S: FloatArray, gate: float
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return F̄ (2, 2) and θ (2,) by these residuals, too; None if S is indefinite."""
+def _learn(factors: Factors, residuals: _Residuals, S: FloatArray, gate: float) -> None:
+    """Let the factors F̄ (2, 2) and θ (2,) learn from these residuals, too."""
     axes, k = residuals.axes, residuals.axes.point
     C = axes.output_matrix(residuals.points + 0.5 * residuals.r).reshape(-1, axes.p)
     # As the likelihood at θ has it, which may be less than is applied.
@@ -415,10 +435,7 @@ def _learnt(
         S = S + C.dot((N - factors.shares).sum(axis=0)).dot(C.T)
     r = residuals.flat
     while True:
-        L, is_indefinite = dpotrf(S, lower=1)
-        if is_indefinite:
-            return None
-        solved = dpotrs(L, np.column_stack([r, C]), lower=1)[0]
+        solved = solve_definite(S, np.column_stack([r, C]))
         squared, m = float(r.dot(solved[:, 0])), len(r) // k
         if squared <= gate**2:
             break
@@ -428,84 +445,82 @@ def _learnt(
         used = np.flatnonzero(np.repeat(passed, k))  # some few are left out
         S, C, r = S[np.ix_(used, used)], C[used], r[used]
     u, G = C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:])
-    return learnt_factors(factors.logs, factors.information, *score(u, G, N, squared, len(solved)))
-
-
-def _take_over(factors: Factors | None, learnt: tuple[FloatArray, FloatArray] | None) -> None:
-    if factors is None or learnt is None:
-        return
-    factors.information[:], factors.logs[:] = learnt
+    factors.information[:], factors.logs[:] = learnt(
+        factors.logs, factors.information, *score(u, G, N, squared, len(solved))
+    )
     if factors.least < math.inf:
         factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
 
 
-def _weights(residuals: _Residuals, judged: _Judged, limits: Limits) -> FloatArray | None:
+def _weights(residuals: _Residuals, predicted: FloatArray, limits: Limits) -> FloatArray:
     """Return Huber's weights (m,) of what the correction leaves of the residuals, R S⁻¹ r."""
     R, (m, k, _) = residuals.R, residuals.R.shape
-    weights = huber_weights(judged.S_inv_r.reshape(m, k), R, np.ones(m), limits.huber)
-    for _ in range(REWEIGHTINGS - 1):
+    weights = np.ones(m)
+    for _ in range(REWEIGHTINGS):
+        S = with_blocks(predicted, R / weights[:, None, None])
+        S_inv_r = solve_definite(S, residuals.flat).reshape(m, k)
+        weights = huber_weights(S_inv_r, R, weights, limits.huber)
         if np.count_nonzero(weights == 1.0) == m:
             break
-        S = with_blocks(judged.predicted, R / weights[:, None, None])
-        L, is_indefinite = dpotrf(S, lower=1)
-        if is_indefinite:
-            return None
-        S_inv_r = dpotrs(L, residuals.flat, lower=1)[0]
-        weights = huber_weights(S_inv_r.reshape(m, k), R, weights, limits.huber)
     return weights
 
 
-def _correct(x: FilterState, residuals: _Residuals, weights: FloatArray) -> FloatArray | None:
-    """Return −K r, K = P Hᵀ S⁻¹ (30), (31), and let P become P − K H P; None if S is indefinite.
+def _correct(x: FilterState, residuals: _Residuals, weights: FloatArray) -> FloatArray:
+    """Return −K r, K = P Hᵀ S⁻¹ (30), (31), and let P become P − K H P.
 
-    Or if digits are lost, see :func:`loses_digits`. H takes C at ŷ_i: so no observation says
-    anything of the gauge.
+    H takes C at ŷ_i: so no observation says anything of the gauge.
     """
     C, P, columns = residuals.output_matrix(0.0), x.P, residuals.columns
     q = C.shape[1]
-    HP = C.dot(P[:q]) - P.take(columns, axis=0)
-    HPH = HP[:, :q].dot(C.T) - HP.take(columns, axis=1)
+    HP = C.dot(P[:q])
+    if len(columns):
+        HP -= P.take(columns, axis=0)
+    HPH = HP[:, :q].dot(C.T)
+    if len(columns):
+        HPH -= HP.take(columns, axis=1)
     S = with_blocks(HPH, residuals.R * (residuals.repeated / weights)[:, None, None])
-    L, is_indefinite = dpotrf(S, lower=1)
-    if is_indefinite:
-        return None
-    # W = L⁻¹ H P:  P − Wᵀ W,  K r = Wᵀ L⁻¹ r
-    W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
     errors = np.append(np.arange(residuals.axes.p + len(x.drift)), np.arange(x.first, x.size))
-    if loses_digits(P.diagonal()[errors], W[:, errors], L):
-        return None
-    subtract_square(P, x.size, W)
-    dx: FloatArray = -dtrsv(L, residuals.flat, lower=1).dot(W[:, : x.size])
-    return dx
+    return -kalman_correction(P, x.size, errors, HP, S, residuals.flat)
 
 
-def _write_judged(residuals: _Residuals, judged: _Judged, out: FloatArray) -> None:
-    """Write how far off each residual was, its density given those before it, shares and NIS."""
-    k, m = residuals.axes.point, len(residuals.r)
-    distances, densities, shares = out[: 3 * m].reshape(3, m)
-    distances[:] = mahalanobis(residuals.r[:, :k], diagonal_blocks(judged.S, k))
-    white = dtrsv(judged.L, residuals.flat, lower=1)
-    each = 0.5 * white**2 + np.log(np.diagonal(judged.L)) + LOG_ROOT_2_PI
-    densities[:] = -each.reshape(m, k).sum(axis=1)
-    shares[:] = 1.0 / residuals.repeated
-    out[3 * m] = white.dot(white)
+def _write_judged(
+    residuals: _Residuals, S: FloatArray, passed: BoolArray, out: FloatArray
+) -> None:
+    """Write how far off each residual was, its density given those before it, shares and NIS.
+
+    Of those that are not used there is no density, and they have no part in the NIS.
+    """
+    k = residuals.axes.point
+    distances, densities, shares = out[:-1].reshape(3, -1)
+    distances[residuals.at] = mahalanobis(residuals.r[:, :k], diagonal_blocks(S, k))
+    shares[residuals.at] = 1.0 / residuals.repeated
+    densities[residuals.at] = -math.inf
+    used = np.flatnonzero(np.repeat(passed, k))
+    if len(used):
+        L = cholesky(S[np.ix_(used, used)])
+        white = dtrsv(L, residuals.flat[used], lower=1)
+        each = 0.5 * white**2 + np.log(np.diagonal(L)) + LOG_ROOT_2_PI
+        densities[residuals.at[passed]] = -each.reshape(-1, k).sum(axis=1)
+        out[-1] += white.dot(white)
 
 
 def _record(
     x: FilterState, landmarks: Landmarks, seen: Seen, limits: Limits, out: Observed
 ) -> None:
-    """Note that landmarks were seen, and where they should have been by the corrected state."""
-    rows = seen.rows
+    """Note which landmarks were seen, and where they should have been by the corrected state."""
+    is_used = out.weights > 0.0
+    rows = seen.rows[is_used]
     landmarks.counts[rows] += 1
     landmarks.rejections[rows] = 0
     last_ns = landmarks.last_seen_ns.take(rows)
     is_later = last_ns < seen.stamp_ns
     landmarks.seen_before_ns[rows[is_later]] = last_ns[is_later]
     landmarks.last_seen_ns[rows[is_later]] = seen.stamp_ns
-    points = x.y_ref.take(rows, axis=0) + x.a.take(rows, axis=0)
-    expected = (points - out.A[:3, 3]).dot(out.A[:3, :3])
-    is_sure = landmarks.counts.take(rows) >= limits.confirmations
-    out.lines_of_sight[:] = np.where(is_sure[:, None], expected, out.points) - out.origins
+    out.lines_of_sight[:] = out.points - out.origins
+    at = np.flatnonzero(seen.rows >= 0)
+    at = at[_are_sure(landmarks, seen.rows[at], ~is_used[at], limits)]
+    points = x.y_ref.take(seen.rows[at], axis=0) + x.a.take(seen.rows[at], axis=0)
+    out.lines_of_sight[at] = (points - out.A[:3, 3]).dot(out.A[:3, :3]) - out.origins[at]
 
 
 def _squares(vectors: FloatArray) -> FloatArray:

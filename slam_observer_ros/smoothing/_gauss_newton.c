@@ -47,8 +47,8 @@ static int read_equations(Door *door, PyObject *tuple, Equations *eq) {
         || (eq->b - eq->c) % eq->k)
         return refuse("Equations");
     eq->n = (eq->b - eq->c) / eq->k;
-    return (are_within(eq->poses, eq->M, eq->S - 1) && are_in_order(eq->poses, eq->M)
-            && are_within(eq->landmarks, eq->M, eq->n - 1))
+    return (are_within(eq->poses, eq->M, 0, eq->S - 1) && are_in_order(eq->poses, eq->M)
+            && are_within(eq->landmarks, eq->M, 0, eq->n - 1))
            || refuse("Equations");
 }
 
@@ -116,7 +116,7 @@ static int read_seen(Door *door, PyObject *tuple, const Equations *eq, Seen *see
     seen->c_s = eq->c - seen->first;
     return seen->sensors == NULL
            || (seen->origins != NULL && seen->arms != NULL
-               && are_within(seen->sensors, eq->M, count - 1))
+               && are_within(seen->sensors, eq->M, 0, count - 1))
            || refuse("Seen");
 }
 

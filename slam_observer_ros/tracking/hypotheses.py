@@ -32,15 +32,13 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import cholesky, mahalanobis, transpose
 from slam_observer_ros.models.integration import DelayEvidence
 from slam_observer_ros.models.velocity_history import VelocityHistory
-from slam_observer_ros.tracking import in_parts, usual
+from slam_observer_ros.tracking import filtering
 from slam_observer_ros.tracking.costs import NewLandmarks
 from slam_observer_ros.tracking.covariances import of_pose
 from slam_observer_ros.tracking.hypothesis import Hypothesis, Twins
 from slam_observer_ros.tracking.interpretations import (
-    as_its_ids_say,
     Interpretation,
     interpretations,
-    is_contradicted,
     may_name,
 )
 from slam_observer_ros.tracking.joint_compatibility import (
@@ -49,7 +47,6 @@ from slam_observer_ros.tracking.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.tracking.matching import calibrated, match, MatchedObservation
 from slam_observer_ros.tracking.slip import stray
 from slam_observer_ros.tracking.standing import Drift, MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.tracking.state import State
@@ -181,7 +178,7 @@ class Hypotheses:
         Hypotheses are moved on from ``start_ns``, and the most likely one may be wrong.
         """
         of_each = [
-            usual.pose_after(one.state, velocities, start_ns, end_ns)
+            filtering.pose_after(one.state, velocities, start_ns, end_ns)
             or one.state.pose_after(velocities, start_ns, end_ns)
             for one in self._all
         ]
@@ -202,7 +199,7 @@ class Hypotheses:
             passage = self.best.passage(velocities, start_ns, stamps_ns, with_covariances)
             return self.best.observer.reference_pose @ passage.poses, None
         of_each = [
-            usual.poses_until(one.state, velocities, start_ns, stamps_ns)
+            filtering.poses_until(one.state, velocities, start_ns, stamps_ns)
             or one.state.poses_until(velocities, start_ns, stamps_ns)
             for one in self._all
         ]
@@ -264,7 +261,7 @@ class Hypotheses:
             state = hypothesis.state
             state.observation_noise.stood_s = stood_s
             before = state.observer.A.copy()
-            variances = usual.advance(state, velocities, start_ns, end_ns)
+            variances = filtering.advance(state, velocities, start_ns, end_ns)
             if variances is None:
                 motion = state.motion(velocities, start_ns, end_ns)
                 state.propagate(motion)
@@ -405,21 +402,16 @@ class Hypotheses:
 
     def _observe(self, event: ObservationEvent) -> Update:
         """Use an observation of places."""
-        # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        if len(self._all) == 1 and (used := in_parts.observe(self.best, event)) is not None:
-            self._some_have_ids = True
-            return used[0]
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        if not self._can_weigh:
-            return step(self.best, match(self.best, event))
-        matched = match(self.best, event) if len(self._all) == 1 else None
-        if matched is not None and not unknown:
-            is_clear = self._limit == 1 or not is_contradicted(self.best, matched)
-            if is_clear and not may_name(self.best, matched):
-                return step(self.best, matched)
+        # Nearly always there is one hypothesis, and one meaning: the step, and no more.
+        is_clear = len(self._all) == 1 and not unknown and not may_name(self.best, event.ids)
+        if is_clear or not self._can_weigh:
+            may_refuse = self._can_weigh and self._limit > 1
+            if (update := step(self.best, event, may_refuse)) is not None:
+                return update
         # All hypotheses with all meanings; costs are differences to the most likely one.
-        children = self._follow(event, self._interpret(event, matched))
+        children = self._follow(event, self._interpret(event))
         least_cost = children[0].hypothesis.cost
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:
@@ -456,13 +448,9 @@ class Hypotheses:
         self, hypothesis: Hypothesis, taken: Interpretation, event: ObservationEvent
     ) -> _Child:
         """Let a hypothesis use an observation as one interpretation has it."""
-        state, update = hypothesis.state, taken.update
-        if update is None:
-            state.landmarks.renumber(taken.named_rows, taken.given_ids)
-            used = None
-            if taken.matched is None:  # then its points have no ids but those that it was given
-                used = in_parts.observe(state, replace(event, ids=taken.event.ids))
-            update = used[0] if used else step(state, taken.matched or match(state, taken.event))
+        state = hypothesis.state
+        state.landmarks.renumber(taken.named_rows, taken.given_ids)
+        update = step(state, replace(event, ids=taken.event.ids))
         hypothesis.cost = taken.cost
         if (event.ids == UNKNOWN_ID).any():
             visibility, ids = hypothesis.visibility, taken.event.ids
@@ -474,50 +462,30 @@ class Hypotheses:
             hypothesis.cost += visibility.note(state, taken.event, self._some_have_ids)
         return _Child(hypothesis, taken.event, update)
 
-    def _interpret(
-        self, event: ObservationEvent, matched: MatchedObservation | None
-    ) -> list[tuple[int, Interpretation]]:
+    def _interpret(self, event: ObservationEvent) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.
 
         Their costs include the hypothesis's own. A point that is taken for a new landmark has
-        the same id in all of them. ``matched`` is the observation as a single hypothesis has
-        matched it, None where there are several.
+        the same id in all of them.
         """
         new_ids, margin = self._new_ids(len(event.ids)), pruning_cost(event.ids)
         gate_cost, k = unpaired_cost(self.best.settings.rejection_threshold), self.best.axes.point
         noise = self.best.observation_noise.covariances(event)[:, :k, :k]
         volume = self._all[0].visibility.field_of_view.volume
         new_costs = self._new_landmarks.costs(noise, volume, gate_cost)
+        is_alone = len(self._all) == 1
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, hypothesis in enumerate(self._all):
-            cost = hypothesis.cost
+            cost, state = hypothesis.cost, hypothesis.state
             budget = worst - cost
-            for taken in self._meanings(hypothesis, event, matched, new_ids, new_costs, budget):
+            for taken in interpretations(
+                state, hypothesis.index, event, new_ids, new_costs, budget, is_alone
+            ):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
         return [(number, taken) for number, taken in possible if taken.cost <= worst]
-
-    def _meanings(
-        self,
-        hypothesis: Hypothesis,
-        event: ObservationEvent,
-        matched: MatchedObservation | None,
-        new_ids: IntArray,
-        new_costs: FloatArray,
-        budget: float,
-    ) -> list[Interpretation]:
-        """Return what an observation may mean to a hypothesis: :func:`.interpretations`."""
-        state, index = hypothesis.state, hypothesis.index
-        seen = calibrated(state, event)
-        if matched is not None:
-            return interpretations(state, index, seen, matched, new_ids, new_costs, budget, True)
-        used = in_parts.observe(state, event, with_expected=True)
-        if used is not None:
-            return [as_its_ids_say(state, seen, *used)]
-        matched = match(state, seen)
-        return interpretations(state, index, seen, matched, new_ids, new_costs, budget)
 
     def _new_ids(self, m: int) -> IntArray:
         """Return ids (m,) that no landmark of any hypothesis has, nor one of a loaded map."""

@@ -12,11 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
-from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.filter.robust import accepted
-from slam_observer_ros.lie.matrices import mahalanobis
 from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.tracking.assignments import Assignment, find_assignments
 from slam_observer_ros.tracking.costs import (
@@ -26,9 +24,8 @@ from slam_observer_ros.tracking.costs import (
     SLIP_COST,
 )
 from slam_observer_ros.tracking.hypothesis import LandmarkIndex
-from slam_observer_ros.tracking.joint_compatibility import joint_cost
 from slam_observer_ros.tracking.matching import (
-    Expected,
+    calibrated,
     is_contradiction,
     match,
     MatchedObservation,
@@ -51,17 +48,14 @@ class Interpretation:
     # (j,) landmarks that had no id of their own so far, and the ids that they get.
     named_rows: IntArray = field(default_factory=_none)
     given_ids: IntArray = field(default_factory=_none)
-    matched: MatchedObservation | None = None  # with the landmarks of these ids, where it is so
     # (m,) that each point's landmark exists; None if its id says so
     evidence: FloatArray | None = None
-    update: Update | None = None  # where the state has already used it so
 
 
 def interpretations(
     state: State,
     index: LandmarkIndex,
     event: ObservationEvent,
-    matched: MatchedObservation,
     new_ids: IntArray,
     new_costs: FloatArray,
     budget: float,
@@ -69,18 +63,18 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    ``state`` is at its instant, ``index`` has its landmarks, ``matched`` is the observation
-    with the landmarks that its ids name. Points taken for landmarks not seen before get
-    ``new_ids`` (m,), at costs ``new_costs`` (m,) for those without an id.
+    ``state`` is at its instant, ``index`` has its landmarks. Points taken for landmarks not seen
+    before get ``new_ids`` (m,), at costs ``new_costs`` (m,) for those without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """
-    some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
+    event = calibrated(state, event)
+    matched, some_are_unknown = match(state, event), bool((event.ids == UNKNOWN_ID).any())
     if not some_are_unknown:
         rejected = _are_rejected(state, matched.residuals)
         if is_contradiction(rejected):
             return _rejected_or_slipped(state, matched, event, rejected)
-    if some_are_unknown or may_name(state, matched):
+    if some_are_unknown or may_name(state, event.ids):
         found = find_assignments(state, index, event, new_costs, budget, is_alone)
         possible = [_with_ids(state, event, assignment, new_ids) for assignment in found]
         # In a loaded map a robot that is elsewhere is sought anywhere.
@@ -89,33 +83,12 @@ def interpretations(
             possible += _slips_without_ids(state, index, event, new_ids, new_costs, found)
         return possible
     cost = pairing_cost(state, len(event.ids), matched.residuals)
-    return [Interpretation(event, cost, matched=matched)]
+    return [Interpretation(event, cost)]
 
 
-def as_its_ids_say(
-    state: State, event: ObservationEvent, update: Update, expected: Expected | None
-) -> Interpretation:
-    """Return the only meaning of an observation that a state has used as usual."""
-    m = len(event.ids)
-    cost = m * outlier_cost(state)
-    if expected is not None:
-        paired_cost = joint_cost(expected.r, expected.S, expected.R)
-        cost = paired_cost + (m - len(expected.r)) * outlier_cost(state)
-    return Interpretation(event, cost, update=update)
-
-
-def is_contradicted(state: State, matched: MatchedObservation) -> bool:
-    """Return whether the gate rejects most points: then the robot may have slipped."""
-    residuals = matched.residuals
-    if accepted(mahalanobis(*residuals.on(state.axes)), state.settings.rejection_threshold).all():
-        return False  # by all of S they are no further off
-    return is_contradiction(_are_rejected(state, residuals))
-
-
-def may_name(state: State, matched: MatchedObservation) -> bool:
-    """Return whether a point's id may belong to a landmark which had no id so far."""
-    all_are_known = len(matched.known.ids) == len(matched.rows) + len(matched.left_out)
-    if all_are_known:
+def may_name(state: State, ids: IntArray) -> bool:
+    """Return whether one of the ``ids`` (m,) may belong to a landmark which had none so far."""
+    if np.count_nonzero(state.landmarks.rows_of(ids) >= 0) == len(ids):
         return False
     return bool(is_automatic(state.landmarks.ids).any())
 
@@ -135,7 +108,7 @@ def _rejected_or_slipped(
     cost, is_new_cause = rejection_cost(state, matched, rejected)
     accepted_cost = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
     after_slip = _after_slip(state, matched, event) if is_new_cause else None
-    rejecting = Interpretation(event, accepted_cost + cost, matched=matched)
+    rejecting = Interpretation(event, accepted_cost + cost)
     if after_slip is None:
         return [rejecting]
     if state.was_contradicted:
@@ -163,7 +136,7 @@ def _after_slip(
     if _are_rejected(slipped, matched.residuals).any():
         return None
     cost += SLIP_COST + pairing_cost(slipped, len(event.ids), matched.residuals)
-    return Interpretation(event, cost, slipped, matched=matched)
+    return Interpretation(event, cost, slipped)
 
 
 def _slips_without_ids(

@@ -10,18 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import Change, NormalisedInnovation, Reason
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.filter.arrays import SeenOrientations
-from slam_observer_ros.filter.gains import Gains
 from slam_observer_ros.filter.observer import Residuals
-from slam_observer_ros.filter.step import LOG_ROOT_2_PI
 from slam_observer_ros.lie import se3
-from slam_observer_ros.lie.matrices import cholesky, diagonal_blocks, mahalanobis
 from slam_observer_ros.models import sensing
-from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.models.observation_noise import RESOLUTION_M
-from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.tracking.state import State
 
 SAME_POSITION = 4.0
@@ -92,18 +85,6 @@ def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, Int
     return event.select(is_known), rows[is_known]
 
 
-def enter(state: State, event: ObservationEvent, noise: FloatArray) -> None:
-    """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
-    limit, new = state.settings.max_landmarks, len(event.ids)
-    m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
-    state.counts.note(Reason.UNMAPPED, event.ids[m:], event.stamp_ns)
-    if m:
-        event = calibrated_again(state, event.select(np.arange(new) < m))
-        state.gains.add(event.points, noise[:m], sensitivity(state, event))
-        state.landmarks.add(event.ids, event.stamp_ns)
-        state.counts.note(Change.FOUND, event.ids, event.stamp_ns)
-
-
 def residuals_of(
     state: State, event: ObservationEvent, rows: IntArray, covariances: FloatArray
 ) -> Residuals:
@@ -114,43 +95,6 @@ def residuals_of(
         D = sensitivity(state, event, state.observer.body_points(rows))
     repeated = state.observation_noise.repetitions(dt_s)
     return state.gains.residuals(rows, event.points, covariances, dt_s, repeated, D)
-
-
-def keyframe_of(
-    state: State,
-    event: ObservationEvent,
-    rows: IntArray,
-    orientations: SeenOrientations | None = None,
-) -> Keyframe:
-    """Return an observation, after its correction, as it is kept to be linearised again."""
-    lines_of_sight, noise = _lines_of_sight(state, event, rows), state.observation_noise
-    is_stated = event.covariances is not None
-    stated = noise.covariances(event, lines_of_sight) if is_stated else None
-    repeated = noise.repetitions(state.landmarks.unseen_s(rows, event.stamp_ns))
-    return Keyframe(
-        event.stamp_ns,
-        rows,
-        event.points,
-        lines_of_sight,
-        stated,
-        repeated,
-        orientations,
-        event.sensed,
-        event.kinds,
-        event.sensor,
-    )
-
-
-def reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray) -> None:
-    """Count points (m,) that were rejected, off by r (m, 3), against their landmarks.
-
-    But not what is off by the sensor's lasting error, while the robot stands: that is no news.
-    """
-    state.counts.note(Reason.REJECTED, event.ids, event.stamp_ns)
-    if state.observation_noise.stood_s > 0.0:
-        far = beyond_driving(event.points, r, state.settings)
-        event, rows = event.select(far), rows[far]
-    state.landmarks.reject(rows, *positions(state, event))
 
 
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
@@ -207,47 +151,3 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     if np.count_nonzero(is_sure) < len(rows):
         points = np.where(is_sure[:, None], points, event.points)
     return points if event.sensor is None else points - event.sensor
-
-
-@dataclass(frozen=True, slots=True)
-class Expected:
-    """Residuals of m points before a correction, metres, and what was expected of them."""
-
-    r: FloatArray  # (m, k)
-    distances: FloatArray  # (m,) Mahalanobis distance of each
-    R: FloatArray  # (m, k, k) the part of their covariance that comes from the points, m²
-    S: FloatArray  # (m k, m k) their joint covariance, m²; empty if it is not known
-
-    @classmethod
-    def of(cls, gains: Gains, residuals: Residuals) -> Expected:
-        """Ask gains, before they correct the state."""
-        r, R = residuals.on(gains.axes)
-        if not len(r):
-            return cls(r, np.empty(0), R, np.empty((0, 0)))
-        if len(S := gains.innovation_covariance(residuals)):
-            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), R, S)
-        return cls(r, gains.distances(residuals), R, S)
-
-    def judge(self, weights: FloatArray, shares: FloatArray) -> NormalisedInnovation:
-        """Return how far off the residuals are, given the weights (m,) of the correction.
-
-        ``shares`` (m,) is what each is worth of an observation with new errors.
-        """
-        (m, k), used = self.r.shape, weights > 0.0
-        nis, log_densities = None, np.full(m, -np.inf)
-        if len(self.S) and used.any():
-            rows = np.flatnonzero(np.repeat(used, k))
-            L = cholesky(self.S[np.ix_(rows, rows)])
-            # One after the other, each as those before it have it: the product is that of all.
-            white = np.linalg.solve(L, self.r.ravel()[rows])
-            nis = float(white @ white)
-            each = 0.5 * white**2 + np.log(np.diagonal(L)) + LOG_ROOT_2_PI
-            log_densities[used] = -each.reshape(-1, k).sum(axis=1)
-        return NormalisedInnovation(
-            self.distances,
-            weights,
-            nis,
-            0 if nis is None else k * int(np.count_nonzero(used)),
-            log_densities,
-            shares,
-        )

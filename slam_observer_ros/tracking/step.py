@@ -7,6 +7,7 @@ heading's error only if that is small: a tag's orientation corrects it directly.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import overload
 
 import numpy as np
 
@@ -14,96 +15,138 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import Change, Reason, Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.arrays import SeenOrientations
-from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.filter.robust import accepted
+from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.models.sensing import turn_sensitivity
+from slam_observer_ros.tracking.filtering import (
+    correct,
+    Corrected,
+    keyframe,
+    NO_IDS,
+)
+from slam_observer_ros.tracking.filtering import (
+    innovation as innovation_of,
+)
 from slam_observer_ros.tracking.matching import (
+    calibrated,
     calibrated_again,
-    enter,
-    Expected,
     is_contradiction,
-    keyframe_of,
-    mapped,
+    match,
     MatchedObservation,
-    reject,
+    positions,
     residuals_of,
     sensitivity,
 )
 from slam_observer_ros.tracking.state import State
 
 
-def step(state: State, matched: MatchedObservation) -> Update:
-    """One step of the observer (28), from where the velocity has led it (27): the innovation."""
-    matched = correct_by_orientations(state, matched)  # φ_i = log(R_Â Z_i B̂_iᵀ)
-    residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
-    _drop_history_if_full(state, matched)
-    expected = Expected.of(state.gains, residuals) if state.judges_innovations else None
-    weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
-    rejected = weights == 0.0
-    _count(state, matched, rejected)
-    event, rows = _add_new(state, matched)  # y_i° = Â y_i
-    take_over_orientations(state, event, rows)  # B̂_i = R_Â Z_i
-    moved_ids = _relinearise(state, event, rows)
-    _set_velocities(state, event, rows)  # (19)
-    innovation = None
-    if expected is not None:
-        innovation = expected.judge(weights, 1.0 / residuals.repeated)
-    ids, stamp_ns = matched.known.ids, matched.event.stamp_ns
-    return state.update(stamp_ns, ids, residuals.r, rejected, moved_ids, innovation)
+@overload
+def step(state: State, event: ObservationEvent) -> Update: ...
 
 
-def _correct(state: State, residuals: Residuals) -> FloatArray:
-    """Correct the state; return the weights (m,), 0 for a rejected landmark."""
-    if not len(residuals.rows):
-        return np.empty(0)
-    before = state.observer.A.copy()
-    weights = state.gains.observe(residuals)
-    state.relinearisation.note_correction(before, state.observer.A)
-    return weights
+@overload
+def step(state: State, event: ObservationEvent, may_refuse: bool) -> Update | None: ...
 
 
-def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> None:
-    """Count which known landmarks (m,) were accepted, and which rejected."""
-    event, rows, count = matched.known, matched.residuals.rows, int(np.count_nonzero(rejected))
-    state.counts.note(Reason.UNMAPPED, matched.left_out, event.stamp_ns)
-    if not len(rows):
-        return
-    state.rejected_in_a_row = state.rejected_in_a_row + 1 if count == len(rows) else 0
-    state.was_contradicted = is_contradiction(rejected)
-    state.landmarks.accept(rows[~rejected] if count else rows, event.stamp_ns)
-    if count:
-        reject(state, event.select(rejected), rows[rejected], matched.residuals.r[rejected])
+def step(state: State, event: ObservationEvent, may_refuse: bool = False) -> Update | None:
+    """One step of the observer (28), from where the velocity has led it (27): the innovation.
 
-
-def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Relinearise, if it is time; relocate doubtful landmarks that this does not explain."""
-    # After the correction it is known better where they were seen.
-    in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
-    some_are = bool(np.count_nonzero(in_doubt))
-    past = state.relinearisation
-    if past.is_active:
-        turns = seen_orientations(state, event, rows)
-        state.keep(keyframe_of(state, event, rows, turns), some_are)
-    if some_are:
-        return _relocate_moved(state, event.select(in_doubt), rows[in_doubt])
-    return np.empty(0, dtype=np.int64)
-
-
-def _drop_history_if_full(state: State, matched: MatchedObservation) -> None:
-    """Drop the history before landmarks are forgotten for new ones: it depends on them."""
-    if len(_rows_to_forget(state, matched)):
+    Return what it did; None, with nothing changed, where the gate rejects most of the points, if
+    that ``may_refuse``: then the robot may not be where the state has it.
+    """
+    if state.calibration.corrects_points and event.sensor_frame not in state.calibration.sensors:
+        state.add_sensor(event.sensor_frame)
+    rows = state.landmarks.rows_of(event.ids)
+    # History depends on landmarks that will have to make room.
+    if len(_rows_to_forget(state, event, rows)):
         state.forget_past('landmarks had to make room (max_landmarks)')
+    if event.orientations is not None and state.gains.tags is not None:
+        matched = match(state, event)
+        gate = state.settings.rejection_threshold
+        are_near = accepted(state.gains.distances(matched.residuals), gate)
+        if may_refuse and is_contradiction(~are_near):
+            return None
+        may_refuse = False
+        correct_by_orientations(state, matched, are_near)  # φ_i = log(R_Â Z_i B̂_iᵀ)
+    # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°;  (30), (31)  X̂ ← (D, d_i) · X̂
+    corrected = correct(state, event, rows, may_refuse)
+    if corrected is None:
+        return None
+    known, innovation = rows >= 0, innovation_of(state, corrected)
+    rejected = known & (corrected.out.weights == 0.0)
+    ids, r = event.ids[known], corrected.out.r[known]
+    moved_ids = _follow_landmarks(state, event, corrected, rejected)
+    return state.update(event.stamp_ns, ids, r, rejected[known], moved_ids, innovation)
 
 
-def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEvent, IntArray]:
-    """Add new landmarks; return the points of landmarks in the map by now, and their rows."""
-    event, rows = matched.event, matched.rows
-    if len(matched.known.ids) == len(rows):
-        return event, rows
+def _follow_landmarks(
+    state: State, event: ObservationEvent, corrected: Corrected, rejected: BoolArray
+) -> IntArray:
+    """Count, add, relocate and keep what was seen; return ids of landmarks that have moved."""
+    rows, shown = corrected.rows, event
+    known, some_rejected = rows >= 0, bool(np.count_nonzero(rejected))
+    all_known = np.count_nonzero(known) == len(rows)
+    if not all_known or some_rejected or event.orientations is not None:
+        shown = calibrated(state, event)
+    if known.any():
+        all_rejected = np.count_nonzero(rejected) == np.count_nonzero(known)
+        state.rejected_in_a_row = state.rejected_in_a_row + 1 if all_rejected else 0
+        state.was_contradicted = some_rejected and is_contradiction(rejected[known])
+    if some_rejected:
+        _reject(state, shown.select(rejected), rows[rejected], corrected.out.r[rejected])
+    if not all_known:
+        rows = _add_new(state, shown, rows)  # y_i° = Â y_i
+    kept = rows >= 0
+    in_map, at = (shown, rows) if kept.all() else (shown.select(kept), rows[kept])
+    if event.orientations is not None:
+        take_over_orientations(state, in_map, at)  # B̂_i = R_Â Z_i
+    # After the correction it is known better where doubtful landmarks were seen.
+    in_doubt = state.landmarks.in_doubt(at, state.settings.max_rejections) & state.is_mapping
+    some_in_doubt = bool(np.count_nonzero(in_doubt))
+    if state.relinearisation.is_active and len(at):
+        turns = seen_orientations(state, in_map, at)
+        state.keep(keyframe(state, event, corrected, rows, turns), some_in_doubt)
+    moved_ids = NO_IDS
+    if some_in_doubt:
+        in_map = calibrated(state, in_map)
+        moved_ids = _relocate_moved(state, in_map.select(in_doubt), at[in_doubt])
+    _set_velocities(state, in_map, at)  # (19)
+    return moved_ids
+
+
+def _reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray) -> None:
+    """Count points (m,) that were rejected, off by r (m, 3), against their landmarks.
+
+    But not what is off by the sensor's lasting error, while the robot stands: that is no news.
+    """
+    state.counts.note(Reason.REJECTED, event.ids, event.stamp_ns)
+    if state.observation_noise.stood_s > 0.0:
+        far = beyond_driving(event.points, r, state.settings)
+        event, rows = event.select(far), rows[far]
+    state.landmarks.reject(rows, *positions(state, event))
+
+
+def _add_new(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
+    """Add new landmarks where they were seen, as many as ``max_landmarks`` allows.
+
+    Return the rows (m,) of the points' landmarks then, −1 where one is not in the map.
+    """
     is_new = rows < 0
-    state.forget(_rows_to_forget(state, matched), Change.FORGOTTEN, event.stamp_ns)
-    enter(state, event.select(is_new), matched.covariances[is_new])
-    return mapped(state, event)
+    if not state.is_mapping:
+        state.counts.note(Reason.UNMAPPED, event.ids[is_new], event.stamp_ns)
+        return rows
+    state.forget(_rows_to_forget(state, event, rows), Change.FORGOTTEN, event.stamp_ns)
+    ids, event, limit = event.ids, event.select(is_new), state.settings.max_landmarks
+    new = len(event.ids)
+    m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
+    state.counts.note(Reason.UNMAPPED, event.ids[m:], event.stamp_ns)
+    if m:
+        event = calibrated_again(state, event.select(np.arange(new) < m))
+        noise = state.observation_noise.covariances(event)
+        state.gains.add(event.points, noise, sensitivity(state, event))
+        state.landmarks.add(event.ids, event.stamp_ns)
+        state.counts.note(Change.FOUND, event.ids, event.stamp_ns)
+    return state.landmarks.rows_of(ids)
 
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
@@ -134,44 +177,41 @@ def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> No
     state.observer.set_landmark_velocities(rows[used], velocities[used])
 
 
-def _rows_to_forget(state: State, matched: MatchedObservation) -> IntArray:
+def _rows_to_forget(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
     """Return landmarks out of view, the least often seen, to be forgotten for the new ones."""
-    limit, new = state.settings.max_landmarks, len(matched.rows) - len(matched.residuals.rows)
+    limit, new = state.settings.max_landmarks, int(np.count_nonzero(rows < 0))
     excess = len(state.landmarks) + new - limit
-    if limit == 0 or new == 0 or excess <= 0:
-        return np.empty(0, dtype=np.int64)
-    unseen = state.landmarks.unseen_since(matched.event.stamp_ns)
-    return np.sort(unseen[~np.isin(unseen, matched.rows)][:excess])
+    if limit == 0 or new == 0 or excess <= 0 or not state.is_mapping:
+        return NO_IDS
+    unseen = state.landmarks.unseen_since(event.stamp_ns)
+    return np.sort(unseen[~np.isin(unseen, rows)][:excess])
 
 
 _NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
 
 
-def correct_by_orientations(state: State, matched: MatchedObservation) -> MatchedObservation:
-    """Correct a state by known orientations; return the observation with its residuals since.
+def correct_by_orientations(
+    state: State, matched: MatchedObservation, are_near: BoolArray
+) -> None:
+    """Correct a state by known orientations.
 
-    Of points that are too far off to be used orientations are not, either. An orientation that is
-    rejected leaves its landmark a point, as seen this time.
+    Of points that are not near enough (m,) to be used orientations are not, either. An orientation
+    that is rejected leaves its landmark a point, as seen this time.
     """
     gains, event, rows = state.gains.tags, matched.known, matched.residuals.rows
     if gains is None or event.orientations is None or not len(rows):
-        return matched
+        return
     gains.learn_motion_noise(matched.residuals)
-    tags, gate = state.observer.orientations, state.settings.rejection_threshold
-    are_near = accepted(state.gains.distances(matched.residuals), gate)
+    tags = state.observer.orientations
     seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
     if not len(seen.rows):
-        return matched
+        return
     before = state.observer.A.copy()
     weights, are_unclear = gains.correct_by_orientations(seen)
     state.relinearisation.note_correction(before, state.observer.A)
     judged = ~are_unclear
     tags.count(seen.rows[judged], weights[judged] > 0.0)
     state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
-    covariances = matched.covariances[matched.rows >= 0]
-    event = calibrated_again(state, event)
-    residuals = residuals_of(state, event, rows, covariances)
-    return replace(matched, known=event, residuals=residuals)
 
 
 def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray) -> None:

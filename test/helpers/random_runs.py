@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.filter.constant import ConstantGains
 from slam_observer_ros.filter.gains import Gains
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.lie import se3
 from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.tracking.filtering import correct
+from slam_observer_ros.tracking.state import State
 
 PLAIN = Settings(
     huber_threshold=0.0,
@@ -50,7 +54,11 @@ def observe(
     filter_: Gains, rows: IntArray, points: FloatArray, covariances: FloatArray
 ) -> FloatArray:
     """Correct a filter by landmarks (m,) seen at ``points`` (m, 3); return their weights."""
-    return filter_.observe(residuals_of(filter_, rows, points, covariances))
+    if isinstance(filter_, ConstantGains):
+        return filter_.observe(residuals_of(filter_, rows, points, covariances))
+    seen = ObservationEvent(0, rows, points, covariances)
+    corrected = correct(State(filter_, filter_._settings), seen, rows)
+    return corrected.out.weights
 
 
 def random_step(

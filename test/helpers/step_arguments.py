@@ -1,4 +1,4 @@
-"""Arguments of the usual step, at random: of motions and of observations, planar and in space."""
+"""Arguments of the step, at random: of motions and of observations, planar and in space."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def random_covariance(rng, size, scale=0.1):
     return scale**2 * M @ M.T / size
 
 
-def random_estimate(rng, n=None, of_tags=False):
+def random_estimate(rng, n=None, of_tags=False, is_exact=False):
     is_planar = bool(rng.integers(2))
     p, k = (3, 2) if is_planar else (6, 3)
     velocity_entries = rng.permutation(42)[: up_to(rng, 18)]
@@ -36,7 +36,7 @@ def random_estimate(rng, n=None, of_tags=False):
     c = len(estimated) + up_to(rng, 60) - 1  # of up to eight sensors
     n = up_to(rng, 200) if n is None else n
     first = p + c + int(rng.integers(0, 9)) * int(rng.integers(2))  # with what is postponed
-    stride = k + of_tags * (p - k)
+    stride = 0 if is_exact else k + of_tags * (p - k)
     size = first + stride * n
     room = size + int(rng.integers(0, 9))
     P = np.zeros((room, room))
@@ -53,7 +53,8 @@ def random_estimate(rng, n=None, of_tags=False):
 
 def random_motion(rng):
     """Return arguments of ``advance``."""
-    x = random_estimate(rng, None if rng.random() < 0.9 else 0, rng.random() < 0.3)
+    n = None if rng.random() < 0.9 else 0
+    x = random_estimate(rng, n, rng.random() < 0.3, rng.random() < 0.1)
     r = int(rng.integers(2, 30))
     steps_ns = rng.integers(1_000_000, 100_000_000, r)
     stamps_ns = START_NS + np.cumsum(steps_ns)
@@ -88,9 +89,9 @@ def random_motion(rng):
 
 def random_observation(rng):
     """Return arguments of ``observe``."""
-    x = random_estimate(rng, of_tags=rng.random() < 0.03)
-    n, p, k = len(x.a), 3 if x.is_planar else 6, 2 if x.is_planar else 3
-    m = min(n, up_to(rng, 40))
+    x = random_estimate(rng, None, rng.random() < 0.2, rng.random() < 0.2)
+    n, p = len(x.a), 3 if x.is_planar else 6
+    m = min(n, up_to(rng, 32))  # of more, numpy takes one block after the other
     rows = rng.permutation(n)[:m]
     now_ns = START_NS
     last_ns = now_ns - rng.integers(0, 3, n) * SECOND_NS
@@ -99,9 +100,11 @@ def random_observation(rng):
     landmarks = Landmarks(counts, rejections, last_ns, before_ns)
     expected = (x.y_ref[rows] + x.a[rows] - x.A[:3, 3]) @ x.A[:3, :3]
     points = expected + 0.1 * rng.standard_normal((m, 3)) * (1.0, 1.0, 1.0 - x.is_planar)
-    points[0, :2] += 20.0 * (rng.random() < 0.15)  # one that is rejected
+    if rng.random() < 0.3:  # some, or most, are rejected
+        points[rng.random(m) < rng.choice([0.1, 0.9]), :2] += 20.0
+    rows[rng.random(m) < rng.choice([0.0, 0.0, 0.3, 1.0])] = -1  # some, or all, are new
     origins = 0.2 * rng.standard_normal((m, 3)) if rng.integers(2) else None
-    c_v = len(x.estimated)
+    c, c_v = len(x.drift), len(x.estimated)
     c_s = min(len(x.drift) - c_v, int(rng.integers(8)))
     is_calibrated = bool(rng.integers(2))
     seen = Seen(
@@ -115,9 +118,10 @@ def random_observation(rng):
         0.01 * rng.standard_normal(7) if is_calibrated else None,
         np.sort(rng.permutation(7)[:c_s]).astype(np.int64),
         c_v,
+        None if is_calibrated or rng.integers(2) else 0.1 * rng.standard_normal((m, 3, c)),
     )
     huber, error_time_s = float(rng.choice([0.0, 1.345])), float(rng.choice([0.0, 0.5]))
-    limits = Limits(6.0, huber, error_time_s, 3, 4)
+    limits = Limits(6.0, huber, error_time_s, 3, 4, int(rng.integers(2)))
     factors = None
     if rng.integers(2):
         shares = np.array([random_covariance(rng, p, 0.02) for _ in range(2)])
@@ -128,9 +132,8 @@ def random_observation(rng):
         *(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3))),
         np.zeros((0 if seen.covariances is None else m, 3, 3)),
         np.zeros(m),
-        np.zeros(x.first),
+        np.zeros(x.size),
         np.zeros(int(rng.choice([0, 3 * m + 1]))),
-        np.zeros(int(rng.choice([0, m * (m + 1) * k * k]))),
     )
     figures = PointFigures(*rng.uniform(1e-4, 1e-2, 5).tolist())
     assert x.size == x.first + x.stride * n

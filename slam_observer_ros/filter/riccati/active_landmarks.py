@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.filter.arrays import FilterArrays, SymmetricMatrix
@@ -96,10 +95,6 @@ class ActiveLandmarks(JointCovariance):
         turn = self._axes.full_pose(x[: self._p])[:3]
         self._postponed.move(turn, x[self._entries])
         self._following.work()
-
-    def write_active(self, column: NDArray[Any], active: NDArray[Any]) -> None:
-        """Write what was read of a ``column`` at the landmarks in P, and changed, back to it."""
-        column[self.active] = active
 
     def note_motion(self) -> None:
         """Let the next observation look at some references, by which motions are judged."""

@@ -53,12 +53,6 @@ class ExactMapCovariance(JointCovariance):
         """Return C_i of r_i = C_i (ε, c̃): [−[ŷ_i]×, I] of ε."""
         return self.chart.output(residuals.landmarks + chord * residuals.r, residuals.D)
 
-    def change_of_residuals(self, residuals: Residuals, x: FloatArray) -> FloatArray:
-        """Return H x (m, k)."""
-        C = self.output_matrix(residuals)
-        change: FloatArray = C @ x[: C.shape[2]]
-        return change
-
     def _project(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
         HP = C @ self.P[: C.shape[1]]
         return HP, HP[:, : C.shape[1]] @ C.T

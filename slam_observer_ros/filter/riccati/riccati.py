@@ -28,9 +28,8 @@ from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
 from slam_observer_ros.filter.riccati.covariances import CompressedCovariance, ExactMapCovariance
 from slam_observer_ros.filter.riccati.orientation_gains import OrientationGains
-from slam_observer_ros.filter.robust import AT_ONCE, observation_weights
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.lie.matrices import block_diagonal, solve_symmetric, with_blocks
+from slam_observer_ros.lie.matrices import block_diagonal, solve_symmetric
 from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -105,38 +104,6 @@ class RiccatiGains(OrientationGains):
         """Return what landmarks (m,), which are going to correct the state, say against it."""
         self.joint.activate(rows)
         return super().residuals(rows, points, covariances, dt_s, repeated, D)
-
-    def observe(self, residuals: Residuals) -> FloatArray:
-        """Move the state by exp(−K r); return the weight that each point was given."""
-        m = len(residuals.rows)
-        if m <= AT_ONCE:
-            x, weights = self._correction(residuals)
-            self._move(x)
-            return weights
-        # One block after the other costs less than all at once, and leaves the same. The state
-        # moves only then: all are linearised at the same point.
-        x, weights = np.zeros(len(self.joint.P)), np.empty(m)
-        for start in range(0, m, AT_ONCE):
-            block = residuals.select(slice(start, start + AT_ONCE))
-            change = self.joint.change_of_residuals(block, x)
-            change_of_x, weights[start : start + AT_ONCE] = self._correction(block.changed(change))
-            x += change_of_x
-        self._move(x)
-        return weights
-
-    def _correction(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-        """Update P; return −K r, and the weight (m,) of each point."""
-        r, R = residuals.on(self.axes)
-        # A gate, then Huber's weights; errors that last make R larger, too.
-        predicted = self.errors.predicted(residuals)[1]
-        self._learn_motion_noise(residuals, r, with_blocks(predicted, R))
-        weights = observation_weights(r, predicted, R, self._settings)
-        passed, used = weights > 0.0, residuals
-        if np.count_nonzero(passed) < len(r):
-            used, r, R = residuals.select(passed), r[passed], R[passed]
-        R = R * (used.repeated / weights[passed])[:, None, None]
-        # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
-        return self.joint.correct(self.joint.output_matrix(used), used.rows, R, r), weights
 
     def add_sensor(self, frame: str) -> None:
         """Let the calibration of the sensor of another frame be part of the state, and of P."""

@@ -1,4 +1,4 @@
-"""The usual step does what the general one does: every step of every world, through both."""
+"""Each step of every world by the compiled core is the same as by numpy, to rounding."""
 
 from __future__ import annotations
 
@@ -17,11 +17,7 @@ from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
 from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking import in_parts, usual
-from slam_observer_ros.tracking.costs import pairing_cost
-from slam_observer_ros.tracking.interpretations import as_its_ids_say
-from slam_observer_ros.tracking.matching import match
-from slam_observer_ros.tracking.step import step
+from slam_observer_ros.tracking import filtering, hypotheses, step
 
 BENCHMARK = Path(__file__).resolve().parents[2] / 'benchmark'
 WORLDS = (
@@ -88,24 +84,24 @@ def assert_same(state, other, what):
 
 
 class BothWays:
-    """Lets hypotheses take each step through both, and counts the usual ones."""
+    """Lets hypotheses take each step by the core and by numpy, and counts what they saw."""
 
     def __init__(self, monkeypatch):
+        self._monkeypatch = monkeypatch
         self.observed = self.moved = self.asked = self.answered = 0
-        self.used = {usual: 0, in_parts: 0}
-        self.entered = self.rejected = 0
-        self._advance, self._observe = usual.advance, in_parts.observe
-        self._ways = {'pose_after': usual.pose_after, 'poses_until': usual.poses_until}
+        self.entered = self.rejected = self.refused = 0
+        self._advance, self._observe = filtering.advance, step.step
+        self._ways = {'pose_after': filtering.pose_after, 'poses_until': filtering.poses_until}
         for name in self._ways:
-            monkeypatch.setattr(usual, name, partial(self.poses, name))
-        monkeypatch.setattr(usual, 'advance', self.advance)
-        monkeypatch.setattr(in_parts, 'observe', self.observe)
+            monkeypatch.setattr(filtering, name, partial(self.poses, name))
+        monkeypatch.setattr(filtering, 'advance', self.advance)
+        monkeypatch.setattr(hypotheses, 'step', self.observe)
 
     def advance(self, state, velocities, start_ns, end_ns):
         other = state.copy()
         variances = self._advance(state, velocities, start_ns, end_ns)
         if variances is None:
-            assert_same(state, other, 'an unusual motion')
+            assert_same(state, other, 'a motion with a gap')
             return None
         motion = other.motion(velocities, start_ns, end_ns)
         other.propagate(motion)
@@ -127,23 +123,20 @@ class BothWays:
             np.testing.assert_allclose(found[1], covariance, rtol=0, atol=1e-12 * size)
         return found
 
-    def observe(self, state, event, with_expected=False):
-        other = state.copy()
+    def observe(self, state, event, may_refuse=False):
+        other, before = state.copy(), state.copy()
         self.observed += 1
-        used = self._observe(state, event, with_expected)
-        if used is None:
-            assert_same(state, other, 'an unusual observation')
-            return None
-        update, weighed = used
-        is_whole = 0 < len(update.ids) == len(event.ids) and not update.rejected.any()
-        self.used[usual if is_whole else in_parts] += 1
-        matched = match(other, event)
-        if with_expected:
-            cost = as_its_ids_say(state, event, update, weighed).cost
-            assert cost == pytest.approx(pairing_cost(other, len(event.ids), matched.residuals))
-        expected = step(other, matched)
+        update = self._observe(state, event, may_refuse)
+        with self._monkeypatch.context() as without_core:
+            without_core.setattr(core, 'COMPILED', None)
+            expected = self._observe(other, event, may_refuse)
         assert_same(state, other, f'the observation at {event.stamp_ns}')
         assert state.counts == other.counts
+        if update is None:
+            assert expected is None
+            assert_same(state, before, 'a refused observation')
+            self.refused += 1
+            return None
         np.testing.assert_array_equal(update.ids, expected.ids)
         np.testing.assert_allclose(update.residuals, expected.residuals, atol=1e-12)
         np.testing.assert_array_equal(update.rejected, expected.rejected)
@@ -154,7 +147,7 @@ class BothWays:
             np.testing.assert_allclose(one, two, rtol=1e-8, atol=1e-9, err_msg=name)
         assert update.innovation.nis == pytest.approx(expected.innovation.nis)
         assert update.innovation.degrees_of_freedom == expected.innovation.degrees_of_freedom
-        return used
+        return update
 
 
 def ask_for_poses(estimator):
@@ -171,7 +164,7 @@ def ask_for_poses(estimator):
 
 
 @pytest.mark.parametrize('name', WORLDS)
-def test_a_usual_step_is_the_general_one_to_rounding(worlds, monkeypatch, name):
+def test_a_step_of_the_core_is_the_same_as_by_numpy(worlds, monkeypatch, name):
     if name not in worlds.names():
         pytest.skip('the recordings are not there')
     world = worlds.load(name)
@@ -184,7 +177,6 @@ def test_a_usual_step_is_the_general_one_to_rounding(worlds, monkeypatch, name):
         ask_for_poses(estimator)
         if isinstance(event, ObservationEvent) and both.observed >= OBSERVATIONS:
             break
-    assert both.used[usual] >= USUAL_SHARE * both.observed
     assert both.entered >= 1
     assert both.moved >= USUAL_SHARE * both.observed
     assert both.answered >= USUAL_SHARE * both.asked or core.COMPILED is None
@@ -201,14 +193,13 @@ def test_so_it_is_where_few_landmarks_of_a_large_map_are_active(worlds, monkeypa
             break
     joint = estimator._state.errors.joint
     assert not joint.is_dense and len(joint.active) < len(estimator.world_points)
-    assert both.used[usual] >= USUAL_SHARE * both.observed
     assert both.entered >= 5
     assert both.moved >= USUAL_SHARE * both.observed
 
 
 @pytest.mark.parametrize('is_planar', [False, True])
 @pytest.mark.parametrize('is_large', [False, True])
-def test_among_tags_with_orientations_motions_are_usual(monkeypatch, is_planar, is_large):
+def test_so_it_is_among_tags_with_orientations(monkeypatch, is_planar, is_large):
     if is_large:
         monkeypatch.setattr(RiccatiGains, 'block', BlockSize(8, 10, kept=4, kept_per_seen=1))
     both, rng = BothWays(monkeypatch), np.random.default_rng(0)
@@ -230,14 +221,11 @@ def test_among_tags_with_orientations_motions_are_usual(monkeypatch, is_planar, 
         )
     joint = estimator._state.errors.joint
     assert joint.is_dense != is_large
-    assert both.moved >= 50 and not both.used[usual]
+    assert both.moved >= 50 and both.observed == 60
 
 
 @pytest.mark.parametrize('name', ['simulated loop, 3D stereo', 'simulated loop, wheeled'])
-def test_what_is_new_or_rejected_is_left_to_python_and_the_rest_is_usual(
-    worlds, monkeypatch, name
-):
-    """With false points, of several hypotheses, to rounding what the general step does."""
+def test_so_it_is_with_false_points_and_of_several_hypotheses(worlds, monkeypatch, name):
     import outliers
 
     world = outliers.with_outliers(worlds.load(name), seed=0)
@@ -250,7 +238,6 @@ def test_what_is_new_or_rejected_is_left_to_python_and_the_rest_is_usual(
         estimator.add(event)
         if isinstance(event, ObservationEvent) and both.observed >= OBSERVATIONS:
             break
-    assert both.used[in_parts] >= 10
     assert both.entered >= 5 and both.rejected >= 3
 
 
