@@ -1,8 +1,8 @@
-/* The usual step in C: the functions of step.py once more, in that order and by the same names.
+/* The step in C: the functions of step.py once more, in that order and by the same names.
  *
  * advance() moves a state along velocities (27), observe() by the innovation (28)-(31), both on
- * the arrays of flat_arrays.py. Whatever is unusual returns UNUSUAL before anything is changed:
- * Python goes on over the same arrays. What the equations mean, and the units, step.py says; a
+ * the arrays of flat_arrays.py. UNUSUAL comes back before anything is changed, for a gap in the
+ * velocities and where rounding has left no digits: Python goes on over the same arrays. What the equations mean, and the units, step.py says; a
  * change is made in both, and test/filter/test_core.py holds each step of either to the other.
  *
  * All that could be read or written beyond an array's end is checked when the arrays come in, in

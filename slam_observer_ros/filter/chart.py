@@ -12,7 +12,7 @@ the pose has ξ_i = ε_v and ω_i = ε_Ω, so that observations have the residua
 
 whatever the map is (A. Barrau and S. Bonnabel, *The invariant extended Kalman filter as a stable
 observer*, 2017). Other coordinates, or one more thing to estimate, are a change of this module;
-step.py and _core.c spell the usual step out.
+step.py and _core.c spell the step out.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How far an observation is trusted: a Mahalanobis gate, then Huber's weight on what passes.
 
-The usual step has both once more (filter/step.py and filter/_core.c); in smoothing, a weight
+The step in C has both once more (filter/_core.c); in smoothing, a weight
 that falls off takes the gate's place (smoothing/observations.py). Where the state is uncertain
 the gate is wide, and outliers pass it.
 

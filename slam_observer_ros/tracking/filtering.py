@@ -34,7 +34,7 @@ from slam_observer_ros.models import sensing
 from slam_observer_ros.models.velocity_history import Velocities, VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.tracking.covariances import of_pose
-from slam_observer_ros.tracking.matching import sensitivity
+from slam_observer_ros.tracking.matching import calibrated, sensitivity
 from slam_observer_ros.tracking.state import State
 
 _NO_ENTRIES, NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
@@ -91,7 +91,7 @@ def _led_to(
     Until each instant along the velocities known then.
     """
     errors, axes = state.errors, state.axes
-    if errors is None or core.COMPILED is None:  # in numpy the general way costs less
+    if errors is None or core.COMPILED is None:  # in numpy :meth:`.State.motion` costs less
         return None
     # Landmarks have no part in it.
     now = errors.joint.of_robot
@@ -171,7 +171,8 @@ def _by_constant_gains(
 ) -> Corrected:
     known = rows >= 0
     seen, out = _seen(state, event, rows, rows), _room(state, event, 0)
-    points, no_noise = event.points[known], np.zeros((np.count_nonzero(known), 3, 3))
+    points = calibrated(state, event).points[known]
+    no_noise = np.zeros((len(points), 3, 3))
     dt_s = state.landmarks.unseen_s(rows[known], event.stamp_ns)
     residuals = gains.residuals(rows[known], points, no_noise, dt_s, np.ones(len(dt_s)))
     out.r[:], out.weights[:] = 0.0, 0.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam_observer_ros.filter.arrays import SymmetricMatrix
+from slam_observer_ros.filter.arrays import subtract_square, SymmetricMatrix
 
 
 @pytest.mark.parametrize('size', [3, 40, 300])
@@ -15,7 +15,7 @@ def test_growing_and_changing_it_is_what_numpy_computes_of_whole_matrices(size):
         matrix.append_zeros(count)
         expected = np.pad(expected, (0, count))
         W, A, B = rng.standard_normal((3, 4, len(expected)))
-        matrix.subtract_square(W)
+        subtract_square(matrix._storage, len(expected), matrix._widened(W))
         matrix.add_symmetric_product(A, B)
         expected = expected - W.T @ W + A.T @ B + B.T @ A
         np.testing.assert_allclose(matrix.values, expected, atol=1e-11)

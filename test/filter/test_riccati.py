@@ -23,14 +23,17 @@ import slam_group
 from strategies import generators, poses
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.filter import core
+from slam_observer_ros.filter import step as filter_step
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Observer
-from slam_observer_ros.filter.riccati import riccati as riccati_module
 from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
+from slam_observer_ros.tracking.filtering import correct
+from slam_observer_ros.tracking.state import State
 
 CALIBRATED = replace(PLAIN, angular_bias_stddev=(0.02,) * 3, linear_scale_stddev=(0.1,) * 3)
 
@@ -168,10 +171,11 @@ def test_an_observation_needs_no_more_memory_than_a_few_times_that_of_the_covari
     points = rng.normal(size=(landmarks, 3))
     riccati.add(points, random_covariances(rng, landmarks, 3))
     V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
-    R = random_covariances(rng, len(rows), 3)
+    seen = ObservationEvent(0, rows, points[rows], random_covariances(rng, len(rows), 3))
+    state = State(riccati, PLAIN)
     tracemalloc.start()
     propagate(riccati, V, np.full(3, 0.1), Q)
-    observe(riccati, rows, points[rows], R)
+    correct(state, seen, rows)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 3 * riccati.joint.P.nbytes
@@ -463,10 +467,11 @@ def test_many_points_in_blocks_leave_what_all_at_once_would(settings, is_exact, 
             each.fix_landmarks(KnownLandmarks(points, np.zeros((12, 3, 3))))
     rows = rng.permutation(12)
     seen = filters[0].observer.body_points(rows) + 0.1 * rng.standard_normal((12, 3))
-    R, all_at_once = 0.01 * random_covariances(rng, 12, 3), riccati_module.AT_ONCE
-    for each, at_once in zip(filters, (all_at_once, 5), strict=True):
+    R = 0.01 * random_covariances(rng, 12, 3)
+    for each, at_once in zip(filters, (filter_step.AT_ONCE, 5), strict=True):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(riccati_module, 'AT_ONCE', at_once)
+            for module in (filter_step, core):
+                patch.setattr(module, 'AT_ONCE', at_once)
             observe(each, rows, seen, R)
     one, other = filters
     np.testing.assert_allclose(other.observer.A, one.observer.A, rtol=0.0, atol=3e-14)
@@ -486,6 +491,7 @@ def test_an_outlier_in_a_later_block_is_judged_by_those_before_it(rng):
     seen = riccati.observer.body_points(rows) + 0.01 * rng.standard_normal((12, 3))
     seen[11] += 1.5
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(riccati_module, 'AT_ONCE', 6)
+        for module in (filter_step, core):
+            patch.setattr(module, 'AT_ONCE', 6)
         weights = observe(riccati, rows, seen, np.tile(1e-4 * np.eye(3), (12, 1, 1)))
     np.testing.assert_array_equal(weights > 0.0, rows < 11)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from hypothesis import given
 import numpy as np
 import pytest
-from random_runs import observe, PLAIN, propagate, random_covariances
+from random_runs import as_stated, observe, PLAIN, propagate, random_covariances
 from strategies import generators
 
 from slam_observer_ros.filter.arrays import SeenOrientations
@@ -95,11 +95,12 @@ def test_orientations_then_points_are_both_at_once(rng):
     H = np.vstack([H_turns, H_points])
     noise = np.zeros((12, 12))
     noise[:6, :6] = sigma_rad**2 * np.eye(6)
-    turned = tags.observer.turned(R)
+    points = tags.observer.body_points(rows)
+    turned = tags.observer.turned(as_stated(points, R))
     noise[6:9, 6:9], noise[9:, 9:] = turned
     at_once = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + noise, H @ P)
     tags.correct_by_orientations(seen(rows, predicted_orientations(tags, rows), sigma_rad))
-    observe(tags, rows, tags.observer.body_points(rows), R)
+    observe(tags, rows, points, R)
     np.testing.assert_allclose(tags.joint.P, at_once, atol=1e-10)
 
 

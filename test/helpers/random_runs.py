@@ -11,6 +11,7 @@ from slam_observer_ros.filter.gains import Gains
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.lie import se3
 from slam_observer_ros.models.motion import Motion
+from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking.filtering import correct
 from slam_observer_ros.tracking.state import State
@@ -59,6 +60,11 @@ def observe(
     seen = ObservationEvent(0, rows, points, covariances)
     corrected = correct(State(filter_, filter_._settings), seen, rows)
     return corrected.out.weights
+
+
+def as_stated(points: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return covariances (m, 3, 3) as a filter takes them: all can be inverted."""
+    return ObservationNoise(PLAIN).covariances(ObservationEvent(0, [], points, covariances))
 
 
 def random_step(

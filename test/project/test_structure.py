@@ -110,7 +110,7 @@ def test_what_is_estimated_is_changed_in_place():
 
 
 def test_one_module_knows_the_coordinates_of_the_errors():
-    """But for the usual step, which spells them out beside the equations."""
+    """But for the step, which spells them out beside the equations."""
     knows = re.compile(r'axes\.(turn|output)_matrix')
     known = list((PACKAGE / 'filter' / 'riccati').rglob('*.py'))
     assert len(known) > 5
