@@ -31,7 +31,8 @@ def test_at_both_ends_of_each_range_the_estimate_stays_one(row):
     models = [name for name in ('stereo', 'fiducial') if name in row.description.lower()]
     model = {'point_noise': 'cartesian'}.get(row.name, (models or ['range_bearing'])[-1])
     for end in (row.minimum, row.maximum):
-        value = (end,) * 3 if isinstance(row.default, tuple) else type(row.default)(end)
+        is_list = isinstance(row.default, tuple)
+        value = (end,) * len(row.default) if is_list else type(row.default)(end)
         often = {'relinearization_interval': 1, 'relinearization_angle': 0.0}
         of_tags = {'observation_model': model, 'use_tag_orientation': model == 'fiducial'}
         settings = Settings(**{**of_tags, **often, row.name: value})

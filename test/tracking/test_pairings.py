@@ -25,7 +25,6 @@ from slam_observer_ros.tracking.joint_compatibility import (
     MAX_PARTIAL,
     Pairs,
 )
-from slam_observer_ros.tracking.matching import match
 
 
 @given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 3), st.sampled_from([2, 3]))
@@ -120,8 +119,7 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         state, index = estimator._hypotheses.best, LandmarkIndex()
-        matched = match(state, event)
-        (only,) = interpretations(state, index, event, matched, np.arange(3), 20.0, np.inf)
+        (only,) = interpretations(state, index, event, np.arange(3), 20.0, np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
