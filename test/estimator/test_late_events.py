@@ -35,7 +35,6 @@ from slam_observer_ros.runs.metrics import average_nees, pose_errors
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking import step as state_step
 from slam_observer_ros.tracking.hypotheses import Hypotheses
-from slam_observer_ros.tracking.matching import match
 from slam_observer_ros.tracking.state import State
 
 
@@ -279,7 +278,7 @@ def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
     settings = Settings(confirmations=1)
     state = State(make_gains(settings, np.eye(4)), settings)
     event = observation(0.0, [0, 1])
-    state_step.step(state, match(state, event))
+    state_step.step(state, event)
     state.observer.body_points = Mock(return_value=event.points)
     velocities = VelocityHistory(timeout_ns=10**9)
     velocities.append(velocity(0.0, np.zeros(6)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hypothesis import given
 import numpy as np
-from random_runs import covariance_of_all, observe, PLAIN, propagate, random_covariances
+from random_runs import as_stated, covariance_of_all, observe, PLAIN, propagate, random_covariances
 from scipy.linalg import block_diag, expm
 from strategies import generators
 
@@ -100,7 +100,7 @@ def test_riccati_filter_is_the_right_invariant_ekf(rng):
         R = 1e-2 * random_covariances(rng, len(rows), 3)
         y = riccati.observer.body_points(rows) + 0.1 * rng.normal(size=(len(rows), 3))
         observe(riccati, rows, y, R)
-        ekf.correct(rows, y, R)
+        ekf.correct(rows, y, as_stated(y, R))
         if number % 7 == 6:
             moved, y = rng.integers(0, n, 1), rng.normal(scale=4.0, size=(1, 3))
             riccati.relocate(moved, y, R[:1])

@@ -44,7 +44,7 @@ def test_a_step_with_ids_takes_no_more_calls_than_it_did(structure):
     step = structure.traced_step()
     # Of the reference in numpy; with the compiled core it is half as many.
     assert len(step.modules) <= 29
-    assert step.changes <= 91
+    assert step.changes <= 80
     assert step.depth <= 12
 
 
