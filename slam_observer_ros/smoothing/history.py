@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import POINT
 from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.lie import se3
@@ -49,6 +49,19 @@ class Keyframe(NamedTuple):
     kinds: IntArray | None = None  # (m,) what is measured of them; None for all of it
     origins: FloatArray | None = None  # (m, 3) where from; None for the base
     marks: Sequence[int] = ()  # (m,) of the observations, where they are of several
+
+    def select(self, kept: BoolArray) -> Keyframe:
+        """Return the points that ``kept`` (m,) picks; ``orientations`` are of these already."""
+        return self._replace(
+            rows=self.rows[kept],
+            points=self.points[kept],
+            lines_of_sight=self.lines_of_sight[kept],
+            covariances=None if self.covariances is None else self.covariances[kept],
+            repeated=self.repeated[kept],
+            sensed=None if self.sensed is None else self.sensed.select(kept),
+            kinds=None if self.kinds is None else self.kinds[kept],
+            origins=None if self.origins is None else self.origins[kept],
+        )
 
 
 def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:

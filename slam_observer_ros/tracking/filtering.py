@@ -339,22 +339,20 @@ def keyframe(
         number = state.calibration.sensors.index(event.sensor_frame)
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(rows), number), origins, seen.arms, event.orientations)
-    repeated = state.observation_noise.repetitions(out.dt_s)
-    stated = out.covariances if len(out.covariances) else None
-    kept = rows >= 0
-    if np.count_nonzero(kept) == len(rows):  # as nearly always
-        points, lines = out.points, out.lines_of_sight
-        return Keyframe(event.stamp_ns, rows, points, lines, stated, repeated, turns, sensed)
-    return Keyframe(
+    every = Keyframe(
         event.stamp_ns,
-        rows[kept],
-        out.points[kept],
-        out.lines_of_sight[kept],
-        None if stated is None else stated[kept],
-        repeated[kept],
+        rows,
+        out.points,
+        out.lines_of_sight,
+        out.covariances if len(out.covariances) else None,
+        state.observation_noise.repetitions(out.dt_s),
         turns,
-        None if sensed is None else sensed.select(kept),
+        sensed,
+        event.kinds,
+        None if event.sensor is None and seen.sensor is None else out.origins,
     )
+    kept = rows >= 0
+    return every if np.count_nonzero(kept) == len(rows) else every.select(kept)
 
 
 def innovation(state: State, corrected: Corrected) -> NormalisedInnovation | None:
