@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.filter.gains import Gains
+from slam_observer_ros.filter.gains import Gains, PlainGains
 from slam_observer_ros.filter.observer import lyapunov, Residuals
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import EstimatedAxes, SPATIAL
@@ -47,6 +47,11 @@ class ConstantGains(Gains):
         'use_tag_orientation',
         'orientation_noise',
     )
+
+    @property
+    def plain(self) -> PlainGains:
+        """Itself."""
+        return self
 
     def observe(self, residuals: Residuals) -> FloatArray:
         """Integrate the innovation (30), (31) over the time since landmarks were seen before."""

@@ -110,6 +110,23 @@ class TagGains(Protocol):
         """Take over orientations as they are seen, where none is known yet."""
 
 
+class PlainGains(Protocol):
+    """What moves X̂ without knowing a covariance of its errors."""
+
+    def observe(self, residuals: Residuals) -> FloatArray:
+        """Move the state by the innovation (28)–(31); return the weights (m,) of the residuals."""
+
+    def residuals(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        dt_s: FloatArray,
+        repeated: FloatArray,
+    ) -> Residuals:
+        """As :meth:`Gains.residuals`."""
+
+
 class Gains(ABC):
     """What moves an ``observer``'s X̂, which starts at ``reference_pose`` P° (4, 4)."""
 
@@ -139,6 +156,11 @@ class Gains(ABC):
     @property
     def tags(self) -> TagGains | None:
         """What moves it by orientations of tags; None where only their positions are used."""
+        return None
+
+    @property
+    def plain(self) -> PlainGains | None:
+        """What moves it where no covariance is known; else :func:`.step.observe` does."""
         return None
 
     # The step (27)-(31)

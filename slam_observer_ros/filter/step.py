@@ -247,7 +247,7 @@ class _Residuals(NamedTuple):
         return self._replace(r=r)
 
     def select(self, wanted: BoolArray | slice) -> _Residuals:
-        """Return those of ``wanted`` (m,) landmarks."""
+        """Return the part of them for ``wanted`` (m,) landmarks."""
         columns = self.columns
         if len(columns):
             columns = columns.reshape(len(self.at), -1)[wanted].ravel()

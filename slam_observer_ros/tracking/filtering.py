@@ -17,7 +17,6 @@ from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter import core, step
 from slam_observer_ros.filter.arrays import SeenOrientations
-from slam_observer_ros.filter.constant import ConstantGains
 from slam_observer_ros.filter.flat_arrays import (
     Advanced,
     FilterState,
@@ -27,6 +26,7 @@ from slam_observer_ros.filter.flat_arrays import (
     Observed,
     Seen,
 )
+from slam_observer_ros.filter.gains import PlainGains
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.sensor_mounting import Sensed
@@ -132,8 +132,8 @@ def correct(
 
     Return None, with nothing changed, where most are rejected and that ``may_refuse``.
     """
-    if isinstance(state.gains, ConstantGains):
-        return _by_constant_gains(state, state.gains, event, rows)
+    if (gains := state.gains.plain) is not None:
+        return _by_plain_gains(state, gains, event, rows)
     joint, known = state.known_errors.joint, rows[rows >= 0]
     joint.activate(known)
     places = np.full(len(rows), -1)
@@ -166,8 +166,8 @@ def correct(
     return Corrected(rows, seen, out)
 
 
-def _by_constant_gains(
-    state: State, gains: ConstantGains, event: ObservationEvent, rows: IntArray
+def _by_plain_gains(
+    state: State, gains: PlainGains, event: ObservationEvent, rows: IntArray
 ) -> Corrected:
     known = rows >= 0
     seen, out = _seen(state, event, rows, rows), _room(state, event, 0)

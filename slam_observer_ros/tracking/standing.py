@@ -34,7 +34,7 @@ from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.tracking import covariances
 from slam_observer_ros.tracking.matching import calibrated
 from slam_observer_ros.tracking.state import State
-from slam_observer_ros.tracking.step import seen_orientations
+from slam_observer_ros.tracking.tags import seen_orientations
 
 SLIPS = (np.zeros(6), np.repeat([1.0, 0.0], 3))
 """Shares (6,) of a motion that are made where wheels spin: nothing, or the turn alone."""
