@@ -132,7 +132,7 @@ def correct(
 
     Return None, with nothing changed, where most are rejected and that ``may_refuse``.
     """
-    if (gains := state.gains.plain) is not None:
+    if state.errors is None and (gains := state.gains.plain) is not None:
         return _by_plain_gains(state, gains, event, rows)
     joint, known = state.known_errors.joint, rows[rows >= 0]
     joint.activate(known)

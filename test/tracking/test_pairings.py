@@ -119,7 +119,7 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         state, index = estimator._hypotheses.best, LandmarkIndex()
-        (only,) = interpretations(state, index, event, np.arange(3), 20.0, np.inf)
+        (only,) = interpretations(state, index, event, np.arange(3), np.full(3, 20.0), np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
