@@ -41,9 +41,6 @@ ITERATIONS = 10
 MIN_VARIANCE = 1e-6
 """Least variance of a motion without odometry, rad² or m²."""
 
-LEAST_S = 1.0
-"""For how long odometry is taken to have been wrong where a robot has strayed, at least."""
-
 
 def slip(state: State, matched: MatchedObservation) -> float:
     """Let the robot have slipped to where it sees these landmarks; return the cost of the motion.
@@ -126,12 +123,12 @@ def _likeliest_pose(
 
 
 def stray(state: State, update: Update) -> None:
-    """Let the pose be as uncertain as if odometry had said nothing for a second, or longer.
+    """Let the pose be as uncertain as if odometry had said nothing for as long as that takes.
 
-    For as long as what is seen takes. What the views do not show has been off for as long.
+    What the views do not show has been off for as long.
     """
     rows = state.landmarks.rows_of(update.ids)
     points = state.observer.body_points(rows[rows >= 0])
     needed_s = _needed_s(state, points, update.residuals[rows >= 0])
-    state.slip(state.observer.A, _noise(state, min(max(needed_s, LEAST_S), MAX_DURATION_S)))
+    state.slip(state.observer.A, _noise(state, min(needed_s, MAX_DURATION_S)))
     state.counts['slip'] += 1
