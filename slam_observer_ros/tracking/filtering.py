@@ -355,7 +355,7 @@ def keyframe(
     return every if np.count_nonzero(kept) == len(rows) else every.select(kept)
 
 
-def innovation(state: State, corrected: Corrected) -> NormalisedInnovation | None:
+def innovation_of(state: State, corrected: Corrected) -> NormalisedInnovation | None:
     """Return how far off the residuals of known landmarks were, if that was asked for."""
     out, known = corrected.out, corrected.rows >= 0
     if not len(out.judged):

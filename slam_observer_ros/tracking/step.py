@@ -14,11 +14,9 @@ from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.tracking.filtering import (
     correct,
     Corrected,
+    innovation_of,
     keyframe,
     NO_IDS,
-)
-from slam_observer_ros.tracking.filtering import (
-    innovation as innovation_of,
 )
 from slam_observer_ros.tracking.matching import (
     calibrated,
