@@ -78,7 +78,8 @@ def _table(
     )
     return (
         f'<section class="{title.lower()}"><h2>{title}</h2><div class="wide"><table>\n'
-        f'<thead><tr>{of_columns}</tr></thead>\n<tbody>\n{of_rows}\n</tbody></table></div></section>'
+        f'<thead><tr>{of_columns}</tr></thead>\n<tbody>\n{of_rows}\n</tbody>'
+        '</table></div></section>'
     )
 
 

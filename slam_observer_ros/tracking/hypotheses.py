@@ -324,7 +324,8 @@ class Hypotheses:
                 counts.note(Reason.CARRIED, event.ids[is_carried], event.stamp_ns)
             event = event.select(~is_carried)
         if self._drift.is_followed:
-            self._drift.covariance = self.best.known_errors.pose_covariance()
+            best = self.best
+            self._drift.before = best.observer.pose.copy(), best.known_errors.pose_covariance()
         update = self._observe(event)
         self._note_ambiguity(event)
         return update

@@ -78,6 +78,11 @@ At the start for half of that.
 UNSEEN_NS = to_ns(1.0)
 """For how long a slip goes on unseen."""
 
+STRAYED = 2.0 * CLEAR
+"""Deviations of the last views together beyond which the pose is wrong: as sensors are
+often twice as noisy as stated, a healthy robot is off by more than :data:`CLEAR` at times.
+"""
+
 MAX_MOTIONS = 500
 """Motions between observations that are remembered."""
 
@@ -493,7 +498,8 @@ class Drift:
 
     def clear(self) -> None:
         """Begin again, as the pose has changed otherwise."""
-        self.covariance: FloatArray | None = None  # (6, 6) of ε, before the present view
+        # The pose (4, 4) before the present view, and the covariance (6, 6) of ε.
+        self.before: tuple[FloatArray, FloatArray] | None = None
         self._stamp_ns = 0
         self._g, self._H, self._V = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
 
@@ -512,7 +518,7 @@ class Drift:
         """
         self.is_followed = True
         elapsed_s = to_s(max(update.stamp_ns - self._stamp_ns, 0))
-        before, self.covariance = self.covariance, None
+        before, self.before = self.before, None
         if elapsed_s > PAUSE_S:
             self.clear()
         self._stamp_ns = update.stamp_ns
@@ -528,7 +534,7 @@ class Drift:
         event = replace(calibrated(state, event).select(seen).select(used), sensed=None)
         rows, in_map = rows[used], in_map[used]
         observer, pose = state.observer, state.axes.pose
-        P = covariances.of_pose(observer, before, observer.A)[pose, pose]
+        P = covariances.of_pose(observer, before[1], observer.A)[pose, pose]
         # Of each the sensor's error, as often as it is new, and the map's, for all of the views.
         share = math.exp(-elapsed_s / RECENT_S)
         views = 1.0 / (1.0 - min(share, LASTING_SHARE))
@@ -551,7 +557,10 @@ class Drift:
             CW = transpose(solve_symmetric(noise, C))
             h = np.sum(CW @ C, axis=0)
             H, V, g = H + h, V + h, g + np.sum(CW @ r[:, :, None], axis=0)[:, 0]
-        self._g, self._H, self._V = g, H, V
+        # What the correction has taken from ε, the views so far no longer show.
+        turn = so3.log(observer.pose[:3, :3] @ before[0][:3, :3].T)
+        moved = np.append(turn, observer.pose[:3, 3] - before[0][:3, 3])[pose]
+        self._g, self._H, self._V = g + H @ moved, H, V
         S = H @ P @ H + V
         if not np.isfinite(S).all():
             return False
@@ -559,7 +568,7 @@ class Drift:
         scale = np.sqrt(np.maximum(np.diagonal(S), np.finfo(np.float64).tiny))
         scaled = g / scale
         inverse = np.linalg.pinv(S / np.outer(scale, scale), rcond=1e-9, hermitian=True)
-        return bool(scaled @ inverse @ scaled > CLEAR**2)
+        return bool(scaled @ inverse @ scaled > STRAYED**2)
 
 
 def _turned(
@@ -567,10 +576,12 @@ def _turned(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return C (t, q, p), noise (t, q, q) and residuals (t, q) of tags' turns, about the world.
 
-    Of each tag the orientation counts that fits better, of two that look nearly the same.
+    Of each tag the orientation counts that fits better, of two that look nearly the same; none
+    that was rejected: the map may have other axes than the detector.
     """
     known, R = state.observer.orientations, state.observer.pose[:3, :3]
-    tags = tags.select(tags.Z.any(axis=(1, 2)) & known.are_known[tags.rows])
+    is_used = known.are_known[tags.rows] & (known.rejections[tags.rows] == 0)
+    tags = tags.select(tags.Z.any(axis=(1, 2)) & is_used)
     B = state.observer.reference_pose[:3, :3] @ known.B[tags.rows]
     both = so3.log(R @ np.array([tags.Z, tags.flipped]) @ transpose(B))
     nearer = np.argmin(np.sum(both**2, axis=2), axis=0)

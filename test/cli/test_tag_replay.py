@@ -122,7 +122,7 @@ def in_a_map(tmp_path, slam_observer, ended):
 def test_orientations_of_a_table_improve_the_pose(in_a_map):
     tags, points = in_a_map('right-up-out'), in_a_map('none', 'false')
     assert tags.errors == ''
-    assert tags.json['heading_rmse_rad'] < 0.5 * points.json['heading_rmse_rad']
+    assert tags.json['heading_rmse_rad'] < 0.7 * points.json['heading_rmse_rad']
 
 
 @pytest.mark.parametrize('tag_axes', ['right-down-in', 'left-down-out'])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from any_events import any_settings, AnyRun, quietly, ROWS
+from any_events import any_settings, AnyRun, as_list, quietly, ROWS
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -32,7 +32,7 @@ def test_at_both_ends_of_each_range_the_estimate_stays_one(row):
     model = {'point_noise': 'cartesian'}.get(row.name, (models or ['range_bearing'])[-1])
     for end in (row.minimum, row.maximum):
         is_list = isinstance(row.default, tuple)
-        value = (end,) * len(row.default) if is_list else type(row.default)(end)
+        value = as_list(row, [end] * len(row.default)) if is_list else type(row.default)(end)
         often = {'relinearization_interval': 1, 'relinearization_angle': 0.0}
         of_tags = {'observation_model': model, 'use_tag_orientation': model == 'fiducial'}
         settings = Settings(**{**of_tags, **often, row.name: value})

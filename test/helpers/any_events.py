@@ -46,8 +46,15 @@ def any_value(rng: np.random.Generator, row: Parameter) -> Value:
         return float(np.clip(low * (row.maximum / low) ** rng.random(), row.minimum, row.maximum))
 
     if isinstance(row.default, tuple):
-        return tuple(number() for _ in row.default)
+        return as_list(row, [number() for _ in row.default])
     return int(number()) if isinstance(row.default, int) else number()
+
+
+def as_list(row: Parameter, numbers: list[float]) -> Value:
+    """Numbers as a parameter takes them: of a pose, the last three are angles."""
+    if len(numbers) == 6:
+        numbers[3:] = np.clip(numbers[3:], -6.28, 6.28).tolist()
+    return tuple(numbers)
 
 
 def any_settings(rng: np.random.Generator, share: float, live_only: bool = False) -> Settings:

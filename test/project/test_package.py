@@ -122,3 +122,18 @@ def test_there_are_executables():
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda script: script.name)
 def test_executables_can_be_loaded(script):
     assert callable(script.load())
+
+
+def test_folders_are_found_by_the_names_that_they_had():
+    code = (
+        'from slam_observer_ros.geometry import se3\n'
+        'from slam_observer_ros.known_map.map_file import read_map\n'
+        'from slam_observer_ros.observer.riccati.riccati import RiccatiGains\n'
+        'from slam_observer_ros import filter, lie, mapping\n'
+        'import slam_observer_ros.filter.riccati.riccati as now\n'
+        'assert lie.se3 is se3 and now.RiccatiGains is RiccatiGains\n'
+        "assert lie.__spec__.name == 'slam_observer_ros.lie'\n"
+        'import slam_observer_ros.geometry.nothing\n'
+    )
+    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=False)
+    assert run.stderr.rstrip().endswith("No module named 'slam_observer_ros.lie.nothing'")
