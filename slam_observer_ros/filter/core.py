@@ -6,7 +6,8 @@ import os
 
 from slam_observer_ros.common.process import compiled, VARIABLE
 from slam_observer_ros.filter import step
-from slam_observer_ros.filter.flat_arrays import FilterState, Landmarks, Limits, Observed, Seen
+from slam_observer_ros.filter.flat_arrays import FilterState, Limits, Observed, Seen
+from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.filter.robust import AT_ONCE
 from slam_observer_ros.models.motion_noise import Factors
 from slam_observer_ros.models.observation_noise import PointFigures

@@ -48,15 +48,6 @@ class Advanced(NamedTuple):
     variances: FloatArray  # (6,) of the motion by axis, body frame, rad² and m²
 
 
-class Landmarks(NamedTuple):
-    """Counts and stamps of n landmarks, changed in place."""
-
-    counts: IntArray  # (n,) as in :class:`.LandmarkTable`, and so the others
-    rejections: IntArray
-    last_seen_ns: IntArray
-    seen_before_ns: IntArray
-
-
 class Seen(NamedTuple):
     """Points seen, body frame, and the sensor that saw them, if it is calibrated."""
 

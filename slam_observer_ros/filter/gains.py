@@ -116,16 +116,6 @@ class PlainGains(Protocol):
     def observe(self, residuals: Residuals) -> FloatArray:
         """Move the state by the innovation (28)–(31); return the weights (m,) of the residuals."""
 
-    def residuals(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        dt_s: FloatArray,
-        repeated: FloatArray,
-    ) -> Residuals:
-        """As :meth:`Gains.residuals`."""
-
 
 class Gains(ABC):
     """What moves an ``observer``'s X̂, which starts at ``reference_pose`` P° (4, 4)."""
@@ -187,6 +177,7 @@ class Gains(ABC):
         ``dt_s`` (m,) is the time since each was last seen, and ``repeated`` (m,) the factor by
         which the covariances grow, as errors last.
         """
+        self.activate(rows)
         observer = self.observer
         e, r = observer.errors(rows, points)
         turned = observer.turned(covariances)

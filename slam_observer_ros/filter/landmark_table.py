@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,57 @@ NEW_S, OLD_S = 60.0, 20.0
 
 MIN_LOOP = 5
 """New landmarks, and old ones, that can say by how they lie whether a loop has closed."""
+
+
+class Landmarks(NamedTuple):
+    """Counts and stamps of n landmarks, changed in place."""
+
+    counts: IntArray  # (n,) as in :class:`.LandmarkTable`, and so the others
+    rejections: IntArray
+    last_seen_ns: IntArray
+    seen_before_ns: IntArray
+
+    def accept(self, rows: IntArray, stamp_ns: int) -> None:
+        """Count one more accepted observation of ``rows`` (m,)."""
+        self.counts[rows] += 1
+        self.rejections[rows] = 0
+        later, last_ns = rows, self.last_seen_ns.take(rows)
+        is_later = last_ns < stamp_ns
+        if np.count_nonzero(is_later) < len(rows):
+            later, last_ns = rows[is_later], last_ns[is_later]
+        self.seen_before_ns[later] = last_ns
+        self.last_seen_ns[later] = stamp_ns
+
+    def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
+        """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
+
+        Two observations of one stamp are of two sensors: at the second a landmark was unseen for
+        as long as at the first.
+        """
+        since_ns = self.last_seen_ns.take(rows)
+        is_seen_now = since_ns == stamp_ns
+        if np.count_nonzero(is_seen_now):
+            since_ns = np.where(is_seen_now, self.seen_before_ns.take(rows), since_ns)
+        unseen_s: FloatArray = to_s(stamp_ns - since_ns)
+        was_never_seen = since_ns < 0
+        if np.count_nonzero(was_never_seen):
+            unseen_s[was_never_seen] = np.inf
+        return unseen_s
+
+    def in_doubt(
+        self, rows: IntArray, max_rejections: int, further: BoolArray | int = 0
+    ) -> BoolArray:
+        """Return which of the rows (m,) have been rejected too often to be trusted.
+
+        That is ``max_rejections`` times, or once more than they were seen: what contradicts a
+        landmark that was seen once or twice may itself be the outlier. Each of them may be about
+        to be rejected ``further`` times.
+        """
+        rejections = self.rejections.take(rows, mode='wrap') + further  # −1 for a new one as well
+        if not np.count_nonzero(rejections):  # as nearly always
+            return np.zeros(len(rows), dtype=np.bool_)
+        needed = np.minimum(self.counts[rows] + 1, max_rejections)
+        return np.asarray(rejections >= needed)
 
 
 class LandmarkTable(LandmarkColumns):
@@ -132,32 +183,18 @@ class LandmarkTable(LandmarkColumns):
         self.evidence[rows[~is_automatic(ids)]] = np.inf
         self._sort()
 
+    @property
+    def columns(self) -> Landmarks:
+        """The columns that the step reads and changes, as views."""
+        return Landmarks(self.counts, self.rejections, self.last_seen_ns, self.seen_before_ns)
+
     def accept(self, rows: IntArray, stamp_ns: int) -> None:
-        """Count one more accepted observation of ``rows`` (m,)."""
-        self.counts[rows] += 1
-        self.rejections[rows] = 0
-        later, last_ns = rows, self.last_seen_ns.take(rows)
-        is_later = last_ns < stamp_ns
-        if np.count_nonzero(is_later) < len(rows):
-            later, last_ns = rows[is_later], last_ns[is_later]
-        self.seen_before_ns[later] = last_ns
-        self.last_seen_ns[later] = stamp_ns
+        """As :meth:`.Landmarks.accept`."""
+        self.columns.accept(rows, stamp_ns)
 
     def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
-        """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
-
-        Two observations of one stamp are of two sensors: at the second a landmark was unseen for
-        as long as at the first.
-        """
-        since_ns = self.last_seen_ns.take(rows)
-        is_seen_now = since_ns == stamp_ns
-        if np.count_nonzero(is_seen_now):
-            since_ns = np.where(is_seen_now, self.seen_before_ns.take(rows), since_ns)
-        unseen_s: FloatArray = to_s(stamp_ns - since_ns)
-        was_never_seen = since_ns < 0
-        if np.count_nonzero(was_never_seen):
-            unseen_s[was_never_seen] = np.inf
-        return unseen_s
+        """As :meth:`.Landmarks.unseen_s`."""
+        return self.columns.unseen_s(rows, stamp_ns)
 
     def are_new(self, rows: IntArray, stamp_ns: int) -> BoolArray:
         """Return which ``rows`` (m,) were first seen of late and are still about."""
@@ -189,18 +226,9 @@ class LandmarkTable(LandmarkColumns):
         shifts_m = np.linalg.norm(points - self.rejected_at[rows], axis=1)
         return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
 
-    def in_doubt(self, rows: IntArray, max_rejections: int, further: int = 0) -> BoolArray:
-        """Return which of the rows (m,) have been rejected too often to be trusted.
-
-        That is ``max_rejections`` times, or once more than they were seen: what contradicts a
-        landmark that was seen once or twice may itself be the outlier. Each of them may be about
-        to be rejected ``further`` times.
-        """
-        rejections = self.rejections.take(rows, mode='wrap') + further  # −1 for a new one as well
-        if not np.count_nonzero(rejections):  # as nearly always
-            return np.zeros(len(rows), dtype=np.bool_)
-        needed = np.minimum(self.counts[rows] + 1, max_rejections)
-        return np.asarray(rejections >= needed)
+    def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
+        """As :meth:`.Landmarks.in_doubt`."""
+        return self.columns.in_doubt(rows, max_rejections)
 
     def note_in_view(self, rows: IntArray, seen: BoolArray, has_moved: bool = True) -> None:
         """Count one more observation that had rows (m,) in view, and which of them it saw.
@@ -222,6 +250,7 @@ class LandmarkTable(LandmarkColumns):
         # The rows in the order of their ids, and these.
         self._order: IntArray = np.argsort(self.ids)
         self._sorted_ids: IntArray = self.ids[self._order]
+        self.some_without_ids = bool(is_automatic(self.ids).any())
 
     @property
     def seen_share(self) -> float:

@@ -45,24 +45,35 @@ def observation_weights(
     Other weights are Huber's. They judge R S⁻¹ r, the residual that the correction leaves, by the
     noise R as in an M-estimator: where the state is uncertain a large residual r is no outlier.
     """
-    gate = settings.rejection_threshold
-    S_inv_r = _solve_residuals(r, predicted, noise)
-    # The gate. No residual is further out than all of them together are.
-    if np.vdot(r, S_inv_r) > gate**2:
-        passed, predicted_passed = gated(r, predicted, noise, gate)
-        if not passed.all():
-            weights = np.zeros(len(r))
-            weights[passed] = observation_weights(
-                r[passed], predicted_passed, noise[passed], settings
-            )
-            return weights
-    # Huber's weights, by reweighted least squares.
-    weights = huber_weights(S_inv_r, noise, np.ones(len(r)), settings.huber_threshold)
-    for _ in range(REWEIGHTINGS - 1):
+    k = r.shape[1]
+    passed = passing(r, with_blocks(predicted, noise), settings.rejection_threshold)
+    used = np.flatnonzero(np.repeat(passed, k))
+    weights = np.zeros(len(r))
+    weights[passed] = reweighted(
+        r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
+    )
+    return weights
+
+
+def passing(r: FloatArray, S: FloatArray, gate: float) -> BoolArray:
+    """Return which residuals (m,) pass the gate, given their covariance S (m k, m k)."""
+    # No residual is further out than all of them together are.
+    if r.ravel().dot(solve_definite(S, r.ravel())) <= gate**2:
+        return np.ones(len(r), dtype=np.bool_)
+    return accepted(mahalanobis(r, diagonal_blocks(S, r.shape[1])), gate)
+
+
+def reweighted(
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, threshold: float
+) -> FloatArray:
+    """Return Huber's weights (m,), by reweighted least squares."""
+    weights = np.ones(len(r))
+    for _ in range(REWEIGHTINGS):
+        S = with_blocks(predicted, noise / weights[:, None, None])
+        S_inv_r = solve_definite(S, r.ravel()).reshape(r.shape)
+        weights = huber_weights(S_inv_r, noise, weights, threshold)
         if np.count_nonzero(weights == 1.0) == len(r):
             break
-        S_inv_r = _solve_residuals(r, predicted, noise / weights[:, None, None])
-        weights = huber_weights(S_inv_r, noise, weights, settings.huber_threshold)
     return weights
 
 
@@ -126,7 +137,3 @@ def huber_weights(
     # R S⁻¹ r is left, by Σ at the distance √((S⁻¹ r)ᵀ Σ S⁻¹ r)/w from zero.
     left = np.sqrt(np.einsum('ij,ijk,ik->i', S_inv_r, noise, S_inv_r)) / weights
     return np.asarray(threshold / np.maximum(left, threshold))
-
-
-def _solve_residuals(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
-    return solve_definite(with_blocks(predicted, noise), r.ravel()).reshape(r.shape)

@@ -22,29 +22,27 @@ from slam_observer_ros.filter.flat_arrays import (
     Advanced,
     FilterState,
     Interval,
-    Landmarks,
     Limits,
     Observed,
     Seen,
 )
-from slam_observer_ros.filter.robust import accepted, AT_ONCE, huber_weights, REWEIGHTINGS
+from slam_observer_ros.filter.landmark_table import Landmarks
+from slam_observer_ros.filter.robust import AT_ONCE, passing, reweighted
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import axes_of, EstimatedAxes
 from slam_observer_ros.lie.matrices import (
     cholesky,
     diagonal_blocks,
     mahalanobis,
-    solve_definite,
     with_blocks,
 )
 from slam_observer_ros.lie.sensor_mounting import sensitivity as sensor_sensitivity
 from slam_observer_ros.models.calibration import calibrated, with_moves
 from slam_observer_ros.models.motion_noise import (
     Factors,
-    learnt,
+    learn,
     motion_variances,
     MotionFigures,
-    score,
     stated_motion_covariances,
 )
 from slam_observer_ros.models.observation_noise import (
@@ -279,29 +277,32 @@ def observe(
     all are linearised at the same point.
     """
     residuals, stated = _residuals(x, landmarks, seen, figures, limits, out)
-    dx, m = np.zeros(len(x.P)), len(residuals.at)
+    axes, k, dx = residuals.axes, residuals.axes.point, np.zeros(len(x.P))
     out.weights[:] = 0.0
-    for start in range(0, m, AT_ONCE):
+    for start in range(0, len(residuals.at), AT_ONCE):
         block = residuals.select(slice(start, start + AT_ONCE))
         block = block.changed(dx) if start else block
         predicted, S = _predicted(x, block)
-        passed = _passed(block, S, limits.gate)
+        passed = passing(block.r[:, :k], S, limits.gate)
         if limits.may_refuse and start == 0 and 2 * np.count_nonzero(passed) < len(passed):
             return REJECTS
         if factors is not None and start == 0:
-            _learn(factors, block, S, limits.gate)
+            C = axes.output_matrix(block.points + 0.5 * block.r)
+            learn(factors, block.r[:, :k], S, C, limits.gate)
         weights = np.zeros(len(passed))
-        used = np.flatnonzero(np.repeat(passed, block.axes.point))
+        used = np.flatnonzero(np.repeat(passed, k))
         if len(out.judged):
             _write_judged(block, S, passed, out.judged)
         if len(used):
             block = block.select(passed)
-            weights[passed] = _weights(block, predicted[np.ix_(used, used)], limits)
+            weights[passed] = reweighted(
+                block.r[:, :k], predicted[np.ix_(used, used)], block.R, limits.huber
+            )
             dx += _correct(x, block, weights[passed])
         out.weights[residuals.at[start : start + AT_ONCE]] = weights
     # (28)  X̂ ← exp(−K r) · X̂:  Â ← exp(ε) Â,  ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i
-    axes, parts = residuals.axes, dx[x.first : x.size].reshape(-1, max(x.stride, 1))
-    X = slam_exp(axes.full_pose(dx[: axes.p]), axes.full_points(parts[:, : axes.point]))
+    parts = dx[x.first : x.size].reshape(-1, max(x.stride, 1))
+    X = slam_exp(axes.full_pose(dx[: axes.p]), axes.full_points(parts[:, :k]))
     R_D = X.A[:3, :3]
     out.A[:] = X.A.dot(x.A)
     if x.stride:
@@ -348,7 +349,7 @@ def _residuals(
         D[:, :, seen.column : seen.column + len(seen.of_sensor)] = (R_hat @ of_sensor)[:, :k]
     out.r[:], out.dt_s[:] = 0.0, np.inf
     out.r[at] = r
-    out.dt_s[at] = dt_s = _unseen_s(landmarks, rows, seen.stamp_ns)
+    out.dt_s[at] = dt_s = landmarks.unseen_s(rows, seen.stamp_ns)
     columns = x.first + np.arange(k) + x.stride * rows[:, None]
     residuals = _Residuals(
         at,
@@ -367,9 +368,8 @@ def _are_sure(
     landmarks: Landmarks, rows: IntArray, further: BoolArray | int, limits: Limits
 ) -> BoolArray:
     """Return which landmarks (m,) are surer than a point seen, with ``further`` rejections."""
-    counts, rejections = landmarks.counts.take(rows), landmarks.rejections.take(rows) + further
-    in_doubt = rejections >= np.minimum(counts + 1, limits.max_rejections)
-    return np.asarray((counts >= limits.confirmations) & ~in_doubt)
+    is_confirmed = landmarks.counts.take(rows) >= limits.confirmations
+    return is_confirmed & ~landmarks.in_doubt(rows, limits.max_rejections, further)
 
 
 def _calibrated(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
@@ -391,13 +391,6 @@ def _calibrated(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, Fl
     return y, origins, stated
 
 
-def _unseen_s(landmarks: Landmarks, rows: IntArray, stamp_ns: int) -> FloatArray:
-    """Return how long landmarks (m,) have not been seen, seconds; by another sensor just now."""
-    last_ns = landmarks.last_seen_ns.take(rows)
-    last_ns = np.where(last_ns == stamp_ns, landmarks.seen_before_ns.take(rows), last_ns)
-    return np.where(last_ns < 0, np.inf, to_s(stamp_ns - last_ns))
-
-
 def _predicted(x: FilterState, residuals: _Residuals) -> tuple[FloatArray, FloatArray]:
     """Return C P Cᵀ of the residuals, and S with the noise of the points, both (m k, m k).
 
@@ -413,56 +406,6 @@ def _predicted(x: FilterState, residuals: _Residuals) -> tuple[FloatArray, Float
     else:
         predicted = C.dot(P[:q, :q]).dot(C.T)
     return predicted, with_blocks(predicted, residuals.R)
-
-
-def _passed(residuals: _Residuals, S: FloatArray, gate: float) -> BoolArray:
-    """Return which residuals (m,) pass the gate."""
-    r, k = residuals.flat, residuals.axes.point
-    # No residual is further out than all of them together are.
-    if r.dot(solve_definite(S, r)) <= gate**2:
-        return np.ones(len(residuals.at), dtype=np.bool_)
-    return accepted(mahalanobis(r.reshape(-1, k), diagonal_blocks(S, k)), gate)
-
-
-def _learn(factors: Factors, residuals: _Residuals, S: FloatArray, gate: float) -> None:
-    """Let the factors F̄ (2, 2) and θ (2,) learn from these residuals, too."""
-    axes, k = residuals.axes, residuals.axes.point
-    C = axes.output_matrix(residuals.points + 0.5 * residuals.r).reshape(-1, axes.p)
-    # As the likelihood at θ has it, which may be less than is applied.
-    ratios = np.exp(factors.logs) / factors.applied
-    N = ratios[:, None, None] * factors.shares
-    if np.count_nonzero(ratios != 1.0):
-        S = S + C.dot((N - factors.shares).sum(axis=0)).dot(C.T)
-    r = residuals.flat
-    while True:
-        solved = solve_definite(S, np.column_stack([r, C]))
-        squared, m = float(r.dot(solved[:, 0])), len(r) // k
-        if squared <= gate**2:
-            break
-        passed = accepted(mahalanobis(r.reshape(m, k), diagonal_blocks(S, k)), gate)
-        if not m < 2 * np.count_nonzero(passed) < 2 * m:
-            break
-        used = np.flatnonzero(np.repeat(passed, k))  # some few are left out
-        S, C, r = S[np.ix_(used, used)], C[used], r[used]
-    u, G = C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:])
-    factors.information[:], factors.logs[:] = learnt(
-        factors.logs, factors.information, *score(u, G, N, squared, len(solved))
-    )
-    if factors.least < math.inf:
-        factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
-
-
-def _weights(residuals: _Residuals, predicted: FloatArray, limits: Limits) -> FloatArray:
-    """Return Huber's weights (m,) of what the correction leaves of the residuals, R S⁻¹ r."""
-    R, (m, k, _) = residuals.R, residuals.R.shape
-    weights = np.ones(m)
-    for _ in range(REWEIGHTINGS):
-        S = with_blocks(predicted, R / weights[:, None, None])
-        S_inv_r = solve_definite(S, residuals.flat).reshape(m, k)
-        weights = huber_weights(S_inv_r, R, weights, limits.huber)
-        if np.count_nonzero(weights == 1.0) == m:
-            break
-    return weights
 
 
 def _correct(x: FilterState, residuals: _Residuals, weights: FloatArray) -> FloatArray:
@@ -509,13 +452,7 @@ def _record(
 ) -> None:
     """Note which landmarks were seen, and where they should have been by the corrected state."""
     is_used = out.weights > 0.0
-    rows = seen.rows[is_used]
-    landmarks.counts[rows] += 1
-    landmarks.rejections[rows] = 0
-    last_ns = landmarks.last_seen_ns.take(rows)
-    is_later = last_ns < seen.stamp_ns
-    landmarks.seen_before_ns[rows[is_later]] = last_ns[is_later]
-    landmarks.last_seen_ns[rows[is_later]] = seen.stamp_ns
+    landmarks.accept(seen.rows[is_used], seen.stamp_ns)
     out.lines_of_sight[:] = out.points - out.origins
     at = np.flatnonzero(seen.rows >= 0)
     at = at[_are_sure(landmarks, seen.rows[at], ~is_used[at], limits)]

@@ -468,7 +468,7 @@ class _Problem:
         is_range = rows % 4 == 0
         odds = straight_odds(sigmas, self._ranges[rows // 4])
         share = straight_share(np.where(is_range, np.sqrt(costs) * np.sign(r), 0.0), odds)
-        # −2 ln of the density of either, over that of a straight one without any error
+        # −2 ln of the density of either, over the density of a straight one without any error
         either = costs + 2.0 * np.log(np.maximum(share, 1e-300))
         return either, np.maximum(weights * share, 1e-9)
 

@@ -174,7 +174,7 @@ class MappedLandmarks:
         self.axes, k = axes, axes.point
         self.points = points  # (n, 3) metres
         self.covariances = np.ascontiguousarray(covariances[:, :k, :k])  # (n, k, k) m²
-        # (k, k) that of the landmark which is known worst: none is gated more tightly
+        # (k, k) covariance of the landmark known worst: none is gated more tightly
         spreads = np.trace(self.covariances, axis1=1, axis2=2)
         self.largest_covariance = self.covariances[np.argmax(spreads)]
         self.tree: Any = cKDTree(points[:, :k])

@@ -399,7 +399,7 @@ def _correlation_lines(
         logger.warning('%s', found('left_out_correlations', count=len(landmarks)))
         return []
     triangle = joint[np.tril_indices(len(joint))].astype('<f8')
-    # Runs are what there is to find, those of zeros in planar maps: at a third of the time.
+    # There are only runs to find, of zeros in planar maps: at a third of the time.
     packing = zlib.compressobj(level=1, strategy=zlib.Z_RLE)
     packed = packing.compress(triangle.tobytes()) + packing.flush()
     data = base64.b64encode(packed).decode('ascii')

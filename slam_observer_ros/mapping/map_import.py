@@ -224,7 +224,7 @@ def _tagslam_rows(
             left_out.append(f'body {shown(name)}, which has no pose')
             continue
         with naming(f'body {shown(name)}'):
-            # The frame of one that is alone becomes that of the map.
+            # The frame of a body that is alone is the map's.
             in_map = _tagslam_pose(body.get('pose'))
             noise = _tagslam_noise(body.get('pose') or {}, {})
             for tag in [*(body.get('tags') or ()), *_board_tags(body.get('board'))]:

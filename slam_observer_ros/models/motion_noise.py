@@ -264,22 +264,9 @@ class MotionFactors:
 
         They are of the motions since the last time.
         """
-        shares = self._shares
-        self.forget_motion()
-        if shares is None or not shares.ndim:
-            return
-        # As the likelihood at θ has it, which may be less than is applied.
-        ratios = np.exp(self._logs) / self.applied
-        N = ratios[:, None, None] * shares
-        C = C.reshape(-1, C.shape[2])
-        if np.count_nonzero(ratios != 1.0):
-            S = S + C.dot((N - shares).sum(axis=0)).dot(C.T)
-        self._information, self._logs = learnt(
-            self._logs, self._information, *self._score(r, S, C, N)
-        )
-        if self._least < math.inf:
-            self.applied = np.exp(np.maximum(self._logs, self._least))
-        self._found += 1
+        if (factors := self.flat()) is not None:
+            learn(factors, r, S, C, self._settings.rejection_threshold)
+        self.take(factors)
 
     def flat(self) -> Factors | None:
         """Return the factors, and the motion to learn from, as plain arrays; None without one."""
@@ -305,22 +292,35 @@ class MotionFactors:
         """Learn nothing of the motion until now from the next observation."""
         self._shares = np.zeros(())
 
-    def _score(
-        self, r: FloatArray, S: FloatArray, C: FloatArray, N: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return g (2,) and F (2, 2)."""
-        S_inv_r, S_inv_C = np.split(
-            solve_definite(S, np.column_stack([r.ravel(), C])), [1], axis=1
-        )
-        squared, gate = r.ravel().dot(S_inv_r)[0], self._settings.rejection_threshold
-        # No residual is further out than all of them together are.
-        if squared > gate**2:
-            k = r.shape[1]
-            passed = mahalanobis(r, diagonal_blocks(S, k)) <= gate
-            if len(r) < 2 * np.count_nonzero(passed) < 2 * len(r):
-                used = np.flatnonzero(np.repeat(passed, k))
-                return self._score(r[passed], S[np.ix_(used, used)], C[used], N)
-        return score(C.T.dot(S_inv_r)[:, 0], C.T.dot(S_inv_C), N, squared, r.size)
+
+def learn(factors: Factors, r: FloatArray, S: FloatArray, C: FloatArray, gate: float) -> None:
+    """Let factors learn from residuals r (m, k), with S (m k, m k) and C (m, k, p)."""
+    # As the likelihood at θ has it, which may be less than is applied.
+    ratios = np.exp(factors.logs) / factors.applied
+    N = ratios[:, None, None] * factors.shares
+    C = C.reshape(-1, C.shape[2])
+    if np.count_nonzero(ratios != 1.0):
+        S = S + C.dot((N - factors.shares).sum(axis=0)).dot(C.T)
+    factors.information[:], factors.logs[:] = learnt(
+        factors.logs, factors.information, *gated_score(r, S, C, N, gate)
+    )
+    if factors.least < math.inf:
+        factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
+
+
+def gated_score(
+    r: FloatArray, S: FloatArray, C: FloatArray, N: FloatArray, gate: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return g (2,) and F (2, 2) of residuals r (m, k), without some few that are too far off."""
+    solved = solve_definite(S, np.column_stack([r.ravel(), C]))
+    squared, (m, k) = float(r.ravel().dot(solved[:, 0])), r.shape
+    # No residual is further out than all of them together are.
+    if squared > gate**2:
+        passed = mahalanobis(r, diagonal_blocks(S, k)) <= gate
+        if m < 2 * np.count_nonzero(passed) < 2 * m:
+            used = np.flatnonzero(np.repeat(passed, k))
+            return gated_score(r[passed], S[np.ix_(used, used)], C[used], N, gate)
+    return score(C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:]), N, squared, r.size)
 
 
 def proposed(name: str, factor: float, settings: Settings) -> str:

@@ -89,7 +89,7 @@ class Keyframes:
     landmarks: IntArray  # (M,) which landmark it is
     points: FloatArray  # (M, 3) where it was seen, metres, body frame
     information: FloatArray  # (M, k, k) inverse covariance of it, body frame, 1/m²
-    # (M,) how much of it counts: less than 1 where its error is partly that of a point before
+    # (M,) how much of it counts: less than 1 where a point before had partly the same error
     shares: FloatArray
     kinds: IntArray  # (M,) what is measured of it; the rest is completed at each iteration
     origins: FloatArray  # (M, 3) where it was measured from, metres, body frame

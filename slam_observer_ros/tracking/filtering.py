@@ -21,13 +21,13 @@ from slam_observer_ros.filter.flat_arrays import (
     Advanced,
     FilterState,
     Interval,
-    Landmarks,
     Limits,
     Observed,
     Seen,
 )
 from slam_observer_ros.filter.gains import PlainGains
 from slam_observer_ros.filter.joint_covariance import JointCovariance
+from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.sensor_mounting import Sensed
 from slam_observer_ros.models import sensing
@@ -139,8 +139,7 @@ def correct(
     places = np.full(len(rows), -1)
     places[rows >= 0] = joint.places(known)
     x, seen = _estimate(state, joint), _seen(state, event, rows, places)
-    table, settings = state.landmarks, state.settings
-    columns = table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns
+    settings, columns = state.settings, state.landmarks.columns
     in_arrays = _in_arrays(state, joint)
     landmarks = Landmarks(*[column[in_arrays] for column in columns])
     factors = state.motion_noise.factors.flat() if len(known) else None
@@ -174,7 +173,7 @@ def _by_plain_gains(
     points = calibrated(state, event).points[known]
     no_noise = np.zeros((len(points), 3, 3))
     dt_s = state.landmarks.unseen_s(rows[known], event.stamp_ns)
-    residuals = gains.residuals(rows[known], points, no_noise, dt_s, np.ones(len(dt_s)))
+    residuals = state.gains.residuals(rows[known], points, no_noise, dt_s, np.ones(len(dt_s)))
     out.r[:], out.weights[:] = 0.0, 0.0
     out.r[known] = residuals.r
     if len(dt_s):

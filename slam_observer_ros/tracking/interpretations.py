@@ -88,9 +88,8 @@ def interpretations(
 
 def may_name(state: State, ids: IntArray) -> bool:
     """Return whether one of the ``ids`` (m,) may belong to a landmark which had none so far."""
-    if np.count_nonzero(state.landmarks.rows_of(ids) >= 0) == len(ids):
-        return False
-    return bool(is_automatic(state.landmarks.ids).any())
+    table = state.landmarks
+    return table.some_without_ids and bool((table.rows_of(ids) < 0).any())
 
 
 def _rejected_or_slipped(

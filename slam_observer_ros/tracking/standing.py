@@ -79,8 +79,8 @@ UNSEEN_NS = to_ns(1.0)
 """For how long a slip goes on unseen."""
 
 STRAYED = 2.0 * CLEAR
-"""Deviations of the last views together beyond which the pose is wrong: as sensors are
-often twice as noisy as stated, a healthy robot is off by more than :data:`CLEAR` at times.
+"""Deviations of the last views together beyond which the pose is wrong: as sensors are often twice
+as noisy as stated, a healthy robot is off by more than :data:`CLEAR` at times.
 """
 
 MAX_MOTIONS = 500

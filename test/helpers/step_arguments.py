@@ -9,11 +9,11 @@ from slam_observer_ros.filter.flat_arrays import (
     Advanced,
     FilterState,
     Interval,
-    Landmarks,
     Limits,
     Observed,
     Seen,
 )
+from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.lie import se3
 from slam_observer_ros.models.motion_noise import Factors, MotionFigures
 from slam_observer_ros.models.observation_noise import PointFigures

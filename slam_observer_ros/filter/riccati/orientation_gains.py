@@ -155,7 +155,7 @@ class OrientationGains(Gains):
             return
         if known.joint is None:
             self.know_orientations(rows[tags], R[tags], sigmas[tags])
-        else:  # their errors have been taken in together with those of positions
+        else:  # their errors have been taken in together with the positions' errors
             seen = self._settings.max_rejections
             self.observer.orientations.put_known(rows[tags], R[tags], sigmas[tags], seen)
 

@@ -24,7 +24,6 @@ from slam_observer_ros.filter.chart import Chart
 from slam_observer_ros.filter.gains import Errors, OF_CONSTANT_GAINS
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.known_landmarks import anchor, KnownLandmarks
-from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
 from slam_observer_ros.filter.riccati.covariances import CompressedCovariance, ExactMapCovariance
 from slam_observer_ros.filter.riccati.orientation_gains import OrientationGains
@@ -91,19 +90,6 @@ class RiccatiGains(OrientationGains):
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks (m,) are in P."""
         self.joint.activate(rows)
-
-    def residuals(
-        self,
-        rows: IntArray,
-        points: FloatArray,
-        covariances: FloatArray,
-        dt_s: FloatArray,
-        repeated: FloatArray,
-        D: FloatArray | None = None,
-    ) -> Residuals:
-        """Return what landmarks (m,), which are going to correct the state, say against it."""
-        self.joint.activate(rows)
-        return super().residuals(rows, points, covariances, dt_s, repeated, D)
 
     def add_sensor(self, frame: str) -> None:
         """Let the calibration of the sensor of another frame be part of the state, and of P."""
