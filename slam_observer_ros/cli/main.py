@@ -139,6 +139,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the interpreter would end by another one
         return SIGNALLED + signal.SIGINT
+    except RuntimeError:  # as Python before 3.12 makes of any exception while a class is defined
+        if stop.number is None:
+            raise
+        return SIGNALLED + stop.number
     return 0
 
 

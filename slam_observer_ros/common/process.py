@@ -43,13 +43,14 @@ class _Stop:
 
     def __init__(self) -> None:
         self._first_s: float | None = None
+        self.number: int | None = None
 
     def __call__(self, number: int, _frame: FrameType | None) -> None:
         if self._first_s is not None:
             if time.monotonic() - self._first_s > PATIENCE_S:
                 _leave(number, None)
             return
-        self._first_s = time.monotonic()
+        self._first_s, self.number = time.monotonic(), number
         raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(SIGNALLED + number)
 
 

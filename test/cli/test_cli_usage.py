@@ -162,6 +162,35 @@ def test_stopped_in_the_middle(tmp_path, stop):
     assert not list(tmp_path.iterdir())
 
 
+STOPPED_WHILE_A_CLASS_IS_DEFINED = """
+import signal, sys
+from slam_observer_ros.cli import doctor, main
+
+class Attribute:
+    def __set_name__(self, owner, name):
+        signal.raise_signal(signal.{first})
+
+def run(args):
+    class Late:
+        attribute = Attribute()
+
+doctor.run = run
+sys.exit(main.main(['doctor']))
+"""
+
+
+@pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
+def test_stopped_while_a_class_is_defined(stop):
+    ended = subprocess.run(
+        [sys.executable, '-c', STOPPED_WHILE_A_CLASS_IS_DEFINED.format(first=stop.name)],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (ended.returncode, ended.stderr) == (128 + stop, '')
+
+
 STOPPED_TWICE = """
 import atexit, signal, sys
 from slam_observer_ros.cli import doctor, main
