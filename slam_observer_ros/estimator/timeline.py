@@ -20,7 +20,6 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import SPATIAL
 from slam_observer_ros.lie.matrices import transpose
 from slam_observer_ros.models.held_velocities import HeldVelocities
-from slam_observer_ros.models.integration import transition, transition_covariance
 from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
@@ -188,19 +187,16 @@ class Timeline:
     ) -> tuple[FloatArray, FloatArray]:
         """Return how a pose (4, 4) of a stamp, with its covariance (6, 6), is at ``stamp_ns``."""
         end_ns, best = max(self.stamp_ns or 0, stamp_ns), self._hypotheses.best
-        motion = self.motion(stamp_ns, end_ns)
-        calibration = best.calibration
-        noise = transition_covariance(
-            self.velocities, calibration, best.motion_noise, stamp_ns, end_ns
-        )
-        return pose @ motion, of_moved_pose(covariance, pose, motion, noise)
+        motion = best.effect(np.eye(4), self.velocities.flat(), stamp_ns, end_ns)
+        noise = best.axes.full_pose_covariance(motion.noise)
+        return pose @ motion.A, of_moved_pose(covariance, pose, motion.A, noise)
 
     def motion(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return how the body moves (4, 4) between two stamps, backwards if need be."""
         if end_ns < start_ns:
             return se3.inverse(self.motion(end_ns, start_ns))
-        calibration = self._hypotheses.best.calibration
-        return transition(self.velocities, calibration, start_ns, end_ns)
+        flat = self.velocities.flat()
+        return self._hypotheses.best.effect(np.eye(4), flat, start_ns, end_ns).A
 
 
 def carried_forward(
@@ -213,9 +209,9 @@ def carried_forward(
     Where velocities of landmarks are estimated, v is as uncertain as they may be.
     """
     # The motion of the robot since then, and of the landmarks.
-    interval = (event.stamp_ns, state_ns)
-    lag_s, calibration = to_s(state_ns - event.stamp_ns), state.calibration
-    back = se3.inverse(transition(velocities, calibration, *interval))
+    lag_s = to_s(state_ns - event.stamp_ns)
+    motion = state.effect(np.eye(4), velocities.flat(), event.stamp_ns, state_ns)
+    back = se3.inverse(motion.A)
     shifts = _landmark_velocities(state, event, state.observer.A @ back) * lag_s
     points = event.points + shifts
     # The sensor with them: the distance stays as it was measured.
@@ -223,7 +219,7 @@ def carried_forward(
     shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
     moved = shifted.moved(back)
     # What both add to the noise.
-    Q = transition_covariance(velocities, calibration, state.motion_noise, *interval)
+    Q = state.axes.full_pose_covariance(motion.noise)
     C = back[:3, :3] @ SPATIAL.output_matrix(points)
     shared = len(points) * C @ Q @ transpose(C)
     rows = state.landmarks.rows_of(event.ids)

@@ -115,14 +115,14 @@ typedef struct {
     i64 N, first, stride, is_planar;
     const double *rates;
     const i64 *estimated;
-    const double *drift;
+    const double *drift, *u;
     long n, room, c, c_v;
     int p, k, pose, turns; /* pose: which of the six axes of a twist comes first */
 } FilterState;
 
 static int read_estimate(Door *door, PyObject *tuple, FilterState *x) {
     static const char *const specs[] = {"d44", "dn3", "Dn3", "DRR", "i", "i", "i", "b", "d67",
-                                        "xv", "dcc", NULL};
+                                        "xv", "dcc", "~dn3", NULL};
     if (!read_fields(door, tuple, specs, x, "FilterState"))
         return 0;
     x->p = x->is_planar ? 3 : 6;
@@ -163,10 +163,10 @@ typedef struct {
 static const char *const INTERVAL[] = {"i", "i", "i", "i", "~d6", NULL};
 
 typedef struct {
-    const double *densities, *scales, *factors;
+    const double *densities, *scales, *factors, *unknown;
 } MotionFigures;
 
-static const char *const MOTION_FIGURES[] = {"d6", "d6", "d2", NULL};
+static const char *const MOTION_FIGURES[] = {"d6", "d6", "d2", "d6", NULL};
 
 typedef struct {
     double *A, *noise, *of_turning, *F, *at_end, *variances;
@@ -599,7 +599,7 @@ static int advance(const FilterState *x, const Velocities *v, const Interval *in
                    const MotionFigures *figures, const Advanced *out) {
     if (!is_stamp(interval->start_ns) || !is_stamp(interval->end_ns)
         || !is_stamp(interval->delay_ns) || !is_stamp(interval->reach_ns)
-        || !is_stamp(v->timeout_ns) || (interval->reach_ns && !x->c_v))
+        || !is_stamp(v->timeout_ns) || (interval->reach_ns && !x->c_v) || x->u != NULL)
         return UNUSUAL;
     i64 start_ns = interval->start_ns - interval->delay_ns;
     i64 end_ns = interval->end_ns - interval->delay_ns;

@@ -6,10 +6,18 @@ import os
 
 from slam_observer_ros.common.process import compiled, VARIABLE
 from slam_observer_ros.filter import step
-from slam_observer_ros.filter.flat_arrays import FilterState, Limits, Observed, Seen
+from slam_observer_ros.filter.flat_arrays import (
+    Advanced,
+    FilterState,
+    Interval,
+    Limits,
+    Observed,
+    Seen,
+)
 from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.filter.robust import AT_ONCE
-from slam_observer_ros.models.motion_noise import Factors
+from slam_observer_ros.models.held_velocities import Velocities
+from slam_observer_ros.models.motion_noise import Factors, MotionFigures
 from slam_observer_ros.models.observation_noise import PointFigures
 
 COMPILED = compiled('filter._core')
@@ -24,10 +32,23 @@ def description() -> str:
     return 'numpy, three times slower: the core was not compiled, or from other sources'
 
 
-advance = step.advance if COMPILED is None else COMPILED.advance
-
 MOST_WORK = 1e7
 """Multiplications of a correction of P beyond which numpy, with BLAS, takes less time."""
+
+
+def advance(
+    x: FilterState,
+    velocities: Velocities,
+    interval: Interval,
+    figures: MotionFigures,
+    out: Advanced,
+) -> int:
+    """As :func:`.step.advance`, in C but for what is unusual."""
+    if COMPILED is not None:
+        status: int = COMPILED.advance(x, velocities, interval, figures, out)
+        if status != step.UNUSUAL:
+            return status
+    return step.advance(x, velocities, interval, figures, out)
 
 
 def observe(

@@ -24,6 +24,8 @@ class FilterState(NamedTuple):
     rates: FloatArray  # (6, 7) [M b] of velocities M V + b
     estimated: IntArray  # (c_v,) entries of it, row by row, that c̃ begins with; 42 is the delay
     drift: FloatArray  # (c, c) growth of the covariance of c̃ in a second
+    # (n, 3) velocities of the landmarks, m/s, where these are estimated; their columns come last
+    u: FloatArray | None
 
 
 class Interval(NamedTuple):

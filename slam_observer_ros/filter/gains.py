@@ -9,14 +9,18 @@ D (m, 3, c), reference frame; None where they don't.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from copy import copy
 import math
 from typing import ClassVar, Protocol, TYPE_CHECKING
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.filter import core, step
 from slam_observer_ros.filter.arrays import SeenOrientations
+from slam_observer_ros.filter.flat_arrays import Advanced, FilterState, Interval
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Observer, Residuals
@@ -26,7 +30,7 @@ from slam_observer_ros.models.calibration import (
     Calibration,
     without_calibration,
 )
-from slam_observer_ros.models.motion import Motion, Passage
+from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.motion_noise import MotionNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -50,14 +54,9 @@ class Errors:
         """Return an independent copy for a copy of the observer."""
         return Errors(observer, self.joint.copy(observer), self.axes)
 
-    def pose_covariance(self, motion: Motion | Passage | None = None) -> FloatArray:
-        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come.
-
-        (s, 6, 6) at the s instants of a passage. Zero on axes that are not estimated.
-        """
-        if motion is None:
-            return self.axes.full_pose_covariance(self.joint.pose)
-        return self.axes.full_pose_covariance(motion.pose_covariance(self.joint.of_robot))
+    def pose_covariance(self) -> FloatArray:
+        """Return the covariance (6, 6) of ε in Â = exp(ε) A; zero on axes not estimated."""
+        return self.axes.full_pose_covariance(self.joint.pose)
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
         """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
@@ -155,10 +154,104 @@ class Gains(ABC):
 
     # The step (27)-(31)
 
-    def advance(self, motion: Motion) -> None:
-        """Move pose and landmarks along a motion (27), and account for its noise."""
-        self.observer.propagate(motion.path)
-        self.observer.move_landmarks(motion.duration_s)
+    def flat(self) -> FilterState:
+        """Return the estimate as plain arrays: of the landmarks in P, or all of an exact map."""
+        observer, calibration, errors = self.observer, self.calibration, self.errors
+        rows: IntArray | slice = slice(None)
+        if errors is None:  # as of an exact map
+            P, size = np.zeros((self._robot, self._robot)), self._robot
+            first, stride, u = size, 0, None
+        else:
+            joint, P, size = errors.joint, observer.covariance._storage, observer.covariance._size
+            first, stride = joint.first, 0 if observer.is_exact else joint.chart.stride
+            rows = rows if observer.is_exact else joint.active
+            u = observer.u if joint.chart.velocity else None
+        return FilterState(
+            observer.A,
+            observer.y_ref[rows],
+            observer.a[rows],
+            P,
+            size,
+            first,
+            stride,
+            self._settings.two_d_mode,
+            calibration.rates,
+            calibration.velocity_places,
+            calibration.drift_covariance,
+            u,
+        )
+
+    @property
+    def _robot(self) -> int:
+        """P + c."""
+        return self.axes.p + self.calibration.count
+
+    def advance(self, velocities: Velocities, interval: Interval) -> Advanced:
+        """Move pose and landmarks along velocities (27); return what that did."""
+        duration_s = to_s(interval.end_ns - interval.start_ns)
+        self.observer.move_landmarks(duration_s)
+        if self.errors is not None:
+            self.errors.joint.note_motion(duration_s)
+        x, out = self.flat(), self._room_for_motion()
+        status = core.advance(x, velocities, interval, self.motion_noise.figures, out)
+        x.A[...] = out.A
+        if self.errors is not None:
+            shares = np.array([out.of_turning, out.noise - out.of_turning])
+            self.motion_noise.factors.move(None if status == step.AT_REST else shares)
+        return out
+
+    def slip(self, A: FloatArray, covariance: FloatArray) -> Advanced:
+        """Let the robot be at Â = ``A`` (4, 4): :func:`.step.slip`."""
+        if self.errors is not None:
+            self.errors.joint.note_motion(0.0)
+        x, out = self.flat(), self._room_for_motion()
+        step.slip(x, A, covariance, out)
+        x.A[...] = out.A
+        self.motion_noise.factors.move(None)
+        return out
+
+    def led_to(
+        self, velocities: Iterable[Velocities], intervals: Iterable[Interval]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return Â (s, 4, 4) and covariances (s, 6, 6) of ε after motions, none of which is made.
+
+        Each is along other velocities. Zero on axes that are not estimated, and without errors.
+        """
+        known, p = np.zeros((self._robot, self._robot)), self.axes.p
+        if self.errors is not None:
+            known = self.errors.joint.of_robot
+        x, out = self._alone(self.observer.A), self._room_for_motion()
+        A, covariances = [], []
+        for each, interval in zip(velocities, intervals, strict=True):
+            x.P[...] = known
+            core.advance(x, each, interval, self.motion_noise.figures, out)
+            A.append(out.A.copy())
+            covariances.append(x.P[:p, :p].copy())
+        return np.array(A), self.axes.full_pose_covariance(np.array(covariances))
+
+    def effect(self, A: FloatArray, velocities: Velocities, interval: Interval) -> Advanced:
+        """Return the effect of a motion from Â = ``A`` (4, 4), which is not made."""
+        out = self._room_for_motion()
+        core.advance(self._alone(A), velocities, interval, self.motion_noise.figures, out)
+        return out
+
+    def _alone(self, A: FloatArray) -> FilterState:
+        """Return a robot at ``A`` without landmarks and without errors as plain arrays."""
+        none, size = np.empty((0, 3)), self._robot
+        return self.flat()._replace(
+            A=A, y_ref=none, a=none, P=np.zeros((size, size)), size=size, first=size, u=None
+        )
+
+    def _room_for_motion(self) -> Advanced:
+        p, c = self.axes.p, self.calibration.count
+        return Advanced(
+            A=np.empty((4, 4)),
+            noise=np.empty((p, p)),
+            of_turning=np.empty((p, p)),
+            sensitivity=np.empty((p, c)),
+            at_end=np.empty(6),
+            variances=np.empty(6),
+        )
 
     def activate(self, rows: IntArray) -> None:  # noqa: B027 (most gains treat all alike)
         """See to it that landmarks (m,) are at hand that are going to be observed."""

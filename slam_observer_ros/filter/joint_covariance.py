@@ -21,7 +21,6 @@ from slam_observer_ros.lie.matrices import (
     mended,
     transpose,
 )
-from slam_observer_ros.models.motion import Motion
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -149,14 +148,10 @@ class JointCovariance:
 
     # The step
 
-    def note_motion(self) -> None:
-        """Note that the robot has moved."""
-
-    def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
-        """Let the robot move, and landmarks of velocities ``u`` (n, 3), to ``points`` (n, 3)."""
+    def note_motion(self, duration_s: float) -> None:
+        """Note that the robot has moved, and landmarks for so long."""
         if self.chart.velocity:
-            self._drift_on(len(points), motion.duration_s)
-        self._propagate(motion, self.chart.all_still(points, u))
+            self._drift_on((len(self.P) - self.first) // self._stride, duration_s)
 
     def _drift_on(self, n: int, duration_s: float) -> None:
         """Let ξ_i of n landmarks grow by ũ_i dt; velocities that are known change none."""
@@ -164,21 +159,6 @@ class JointCovariance:
         columns, velocities = self._columns(rows), self.chart.velocities(rows)
         P[columns] += duration_s * P[velocities]
         P[:, columns] += duration_s * P[:, velocities]
-
-    def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
-        """Let x become x + J (F c̃ + w), w the noise of a motion, with J's rows of landmarks."""
-        P, p, c = self.P, self._p, slice(self._p, self.chart.robot)
-        JT = np.zeros((p, len(P)))  # how a motion of the robot alone changes x, transposed
-        JT[:, :p] = np.eye(p)
-        JT[:, self.first :] = J_landmarks.T
-        # P + J (F P_c + F P_c,c Fᵀ Jᵀ / 2 + noise Jᵀ / 2) + its transpose.
-        if p == c.stop:
-            self._matrix.add_symmetric_product(JT, (0.5 * motion.noise).dot(JT))
-            return
-        F = motion.sensitivity
-        noise = motion.noise + F.dot(P[c, c]).dot(F.T)
-        self._matrix.add_symmetric_product(JT, F.dot(P[c]) + (0.5 * noise).dot(JT))
-        P[c, c] += motion.drift
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
         """Return C_i of r_i = C_i (ε, c̃) − ξ_i, at ``chord`` from ŷ_i to the point seen."""

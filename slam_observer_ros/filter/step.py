@@ -1,7 +1,7 @@
 """The step in numpy: the reference that ``_core.c`` repeats, equation by equation.
 
-A motion along velocities without a gap, and an observation of any points: of few or many known
-landmarks, of new ones, which it leaves out, and of an exact map. The errors are
+A motion, and an observation of any points: of few or many known landmarks, of new ones, which it
+leaves out, and of an exact map. The errors are
 x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, and more of landmarks that turn or move: see
 :mod:`.chart`.
 """
@@ -38,8 +38,10 @@ from slam_observer_ros.lie.matrices import (
 )
 from slam_observer_ros.lie.sensor_mounting import sensitivity as sensor_sensitivity
 from slam_observer_ros.models.calibration import calibrated, with_moves
+from slam_observer_ros.models.held_velocities import held, Velocities
 from slam_observer_ros.models.motion_noise import (
     Factors,
+    gap_variances,
     learn,
     motion_variances,
     MotionFigures,
@@ -52,13 +54,13 @@ from slam_observer_ros.models.observation_noise import (
     RESOLUTION_M,
     stated_covariances,
 )
-from slam_observer_ros.models.velocity_history import Velocities
 
 UNUSUAL, AT_REST, DONE, REJECTS = -1, 0, 1, 2
 """What a step returns; AT_REST where the motion says nothing of the noise of velocities.
 
-UNUSUAL for a motion with a gap, and REJECTS where the gate lets less than half of the points pass,
-if that may be refused: nothing has changed then.
+REJECTS where the gate lets less than half of the points pass, if that may be refused, and UNUSUAL
+for what only numpy does: a motion with a gap, one of landmarks that move, or an observation that
+rounding has left without digits. Nothing has changed then.
 """
 
 _PLANAR = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
@@ -76,12 +78,9 @@ def advance(
     out: Advanced,
 ) -> int:
     """Move X̂ along velocities (27), with what that does to P."""
-    pieces = _pieces(velocities, interval)
-    if pieces is None:
-        return UNUSUAL
-    rows, dt_s, before_s = pieces
-    V = _counting(velocities.body_velocities[rows], x.is_planar)
-    axes, (p, c) = axes_of(x.is_planar), out.sensitivity.shape
+    start_ns, end_ns = interval.start_ns - interval.delay_ns, interval.end_ns - interval.delay_ns
+    pieces, axes = held(velocities, start_ns, end_ns), axes_of(x.is_planar)
+    V, dt_s = _counting(pieces.body_velocities, x.is_planar), pieces.dt_s
     # (27)  Â ← Â exp(V dt), V = M V_measured + b
     path = se3.path(x.A, calibrated(x.rates, V) * dt_s[:, None])
     out.A[:] = path[-1]
@@ -89,50 +88,55 @@ def advance(
     # ε ← ε + F c̃ + w,  w ~ N(0, Σ Ad_Â Q Ad_Âᵀ)
     Ad = se3.adjoint(path)[:, axes.pose]
     # White noise: held longer than usual, one error has moved the robot by so much more.
-    usual_s = np.array([velocities.usual_angular_s, velocities.usual_linear_s])
-    usual_s += max(to_s(-interval.delay_ns), 0.0)
-    Q = motion_variances(V, dt_s, before_s, usual_s, figures)
-    is_stated, stated = velocities.is_stated[rows], None
-    if np.count_nonzero(is_stated):
-        Q[np.repeat(is_stated, 3, axis=1)] = 0.0
+    usual_s = pieces.usual_s + max(to_s(-interval.delay_ns), 0.0)
+    Q = motion_variances(V, dt_s, pieces.before_s, usual_s, figures)
+    stated = None
+    if np.count_nonzero(pieces.is_stated):
+        Q[np.repeat(pieces.is_stated, 3, axis=1)] = 0.0
         stated = stated_motion_covariances(
-            velocities.covariances[rows], dt_s, before_s, figures.factors
+            pieces.covariances, dt_s, pieces.before_s, figures.factors
         )
+    if np.count_nonzero(pieces.gap_s):
+        Q += gap_variances(pieces.gap_s, figures)
     out.variances[:] = Q.sum(axis=0)
     _summed_noise(Ad, se3.at_poses(Q), out)
     if stated is not None:
         out.variances[:] += np.diagonal(stated.sum(axis=0))
         _add_summed(Ad, se3.at_poses(stated), out)
-    F = _sensitivity(x, Ad, V, dt_s, velocities, interval, out)
-    # x ← x + J (F c̃ + w); ξ_i grows by [ŷ_i]× times the turn that is added to ε
+    _write_sensitivity(x, Ad, V, dt_s, velocities, interval, out)
+    _move_errors(x, out)
+    of_c = slice(axes.p, axes.p + len(x.drift))
+    x.P[of_c, of_c] += x.drift * to_s(interval.end_ns - interval.start_ns)
+    return DONE if V.any() and dt_s.all() else AT_REST
+
+
+def slip(x: FilterState, A: FloatArray, covariance: FloatArray, out: Advanced) -> None:
+    """Let the robot be at Â = ``A`` (4, 4), by a motion that odometry has not seen.
+
+    Its ``covariance`` (6, 6) is in the body frame there, rad² and m².
+    """
+    Ad = se3.adjoint(A)[axes_of(x.is_planar).pose]
+    out.A[:], out.noise[:] = A, Ad.dot(covariance).dot(Ad.T)
+    out.variances[:] = covariance.diagonal()
+    out.of_turning[:] = out.sensitivity[:] = out.at_end[:] = 0.0
+    _move_errors(x, out)
+
+
+def _move_errors(x: FilterState, out: Advanced) -> None:
+    """Let x become x + J (F c̃ + w): ξ_i grows by [ŷ_i]× times the turn that is added to ε."""
+    axes, F, (p, c) = axes_of(x.is_planar), out.sensitivity, out.sensitivity.shape
     P, of_c = x.P, slice(p, p + c)
     JT = np.zeros((p, len(P)))
     JT[:, :p] = np.eye(p)
     if x.stride:  # an exact map has no errors
         of_landmarks = JT[:, x.first : x.size].reshape(p, -1, x.stride)
         of_landmarks[:, :, : axes.point] = -axes.turn_matrix(x.y_ref + x.a).transpose(2, 0, 1)
+        if x.u is not None:
+            of_landmarks[:, :, -axes.point :] = -axes.turn_matrix(x.u).transpose(2, 0, 1)
     half = (0.5 * (out.noise + F.dot(P[of_c, of_c]).dot(F.T))).dot(JT)
     if c:
         half += F.dot(P[of_c])
     add_symmetric_product(P, x.size, JT, half)
-    P[of_c, of_c] += x.drift * to_s(interval.end_ns - interval.start_ns)
-    return DONE if V.any() and dt_s.all() else AT_REST
-
-
-def _pieces(
-    velocities: Velocities, interval: Interval
-) -> tuple[slice, FloatArray, FloatArray] | None:
-    """Return k velocities, for how long each is held, and (k, 2) was before; None for gaps."""
-    start_ns, end_ns = interval.start_ns - interval.delay_ns, interval.end_ns - interval.delay_ns
-    first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
-    last = max(int(velocities.stamps_ns.searchsorted(end_ns, 'left')), first + 1)
-    bounds_ns = np.append(velocities.stamps_ns[first:last], end_ns)
-    if end_ns < start_ns or first < 0:
-        return None
-    bounds_ns[0], since_ns = start_ns, velocities.since_ns[first:last]
-    if (since_ns[:, 1] + velocities.timeout_ns < bounds_ns[1:]).any():
-        return None
-    return slice(first, last), to_s(np.diff(bounds_ns)), to_s(bounds_ns[:-1, None] - since_ns)
 
 
 def _counting(V: FloatArray, is_planar: bool) -> FloatArray:
@@ -159,7 +163,7 @@ def _add_summed(Ad: FloatArray, shares: FloatArray, out: Advanced) -> None:
     out.of_turning[:] += half + half.T
 
 
-def _sensitivity(
+def _write_sensitivity(
     x: FilterState,
     Ad: FloatArray,
     V: FloatArray,
@@ -167,7 +171,7 @@ def _sensitivity(
     velocities: Velocities,
     interval: Interval,
     out: Advanced,
-) -> FloatArray:
+) -> None:
     """Write F (p, c): ε' = Ad_Â (M̃ V + b̃), and of a delay what its two ends differ by."""
     F = out.sensitivity
     F[:] = 0.0
@@ -183,7 +187,6 @@ def _sensitivity(
         out.at_end[:] = _mean_about(interval.end_ns, velocities, interval, x.is_planar)
         before, after = calibrated(x.rates, at_start), calibrated(x.rates, out.at_end)
         F[:, len(x.estimated) - 1] = Ad[0].dot(before) - Ad[-1].dot(after)
-    return F
 
 
 def _mean_about(

@@ -199,20 +199,6 @@ def summed_noise(Ad: FloatArray, covariances: FloatArray) -> FloatArray:
     return noise
 
 
-def summed_noise_until(Ad: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return :func:`summed_noise` from the first to each of the poses (k + 1, p, p)."""
-    Ad_transposed = Ad.swapaxes(-1, -2)
-    ends = Ad[:-1] @ covariances @ Ad_transposed[:-1] + Ad[1:] @ covariances @ Ad_transposed[1:]
-    return summed_until(0.5 * ends)
-
-
-def summed_until(pieces: FloatArray) -> FloatArray:
-    """Return the sums (k + 1, …) of what belongs to k pieces (k, …), from none to all of them."""
-    sums = np.zeros((len(pieces) + 1, *pieces.shape[1:]))
-    np.cumsum(pieces, axis=0, out=sums[1:])
-    return sums
-
-
 def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -> FloatArray:
     """Return poses at a ``share`` (…), 0 to 1, of the way between two, as tf2 has them.
 

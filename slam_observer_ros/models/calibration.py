@@ -20,9 +20,7 @@ import numpy as np
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
-from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import EstimatedAxes
-from slam_observer_ros.models.held_velocities import HeldUntil, HeldVelocities
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 if TYPE_CHECKING:
@@ -242,62 +240,6 @@ class Calibration:
         shares = variances[: len(self._rows)] * self._rates(body_velocity[None])[0] ** 2
         applied.ravel()[::7] += np.bincount(self._rows, shares, minlength=6)
         return applied
-
-    def sensitivity(
-        self,
-        Ad: FloatArray,
-        measured_velocities: FloatArray,
-        dt_s: FloatArray,
-        at_ends: FloatArray | None,
-    ) -> FloatArray:
-        """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
-
-        It follows from ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay that is too long by τ̃, by which
-        velocities were taken from an interval that begins and ends τ̃ earlier. ``Ad``
-        (k + 1, p, 6) holds the estimated rows of Ad_Â; the other arguments are as in
-        :class:`.Motion`.
-        """
-        if not self.count:
-            return np.empty((Ad.shape[1], 0))
-        shares = se3.at_poses(self._rates(measured_velocities) * dt_s[:, None])
-        of_rates = Ad.take(self._rows, axis=2) * shares[:, None, :]
-        F = np.zeros((Ad.shape[1], self.count))
-        F[:, : len(self._rows)] = of_rates.sum(axis=0)
-        if self.delay_error_ns and at_ends is not None:
-            first, last = self.apply(at_ends)
-            F[:, self.of_velocity - 1] = Ad[0].dot(first) - Ad[-1].dot(last)
-        return F
-
-    def sensitivity_until(
-        self,
-        Ad: FloatArray,
-        held: HeldUntil,
-        Ad_at_ends: FloatArray,
-        at_ends: FloatArray | None,
-    ) -> FloatArray:
-        """Return :meth:`sensitivity` until each of s instants (s, p, c).
-
-        ``Ad`` (k + 1, p, 6) is along the whole pieces, ``Ad_at_ends`` (s, p, 6) at the instants.
-        """
-        counts, rates = held.counts, len(self._rows)
-        of_rates = Ad[:, :, self._rows]
-        shares = self._shares(held.whole)
-        until = se3.summed_until((of_rates[:-1] + of_rates[1:]) * shares)[counts]
-        last = of_rates[counts] + Ad_at_ends[:, :, self._rows]
-        F = np.zeros((len(counts), Ad.shape[1], self.count))
-        F[:, :, :rates] = until + last * self._shares(held.last)
-        if self.delay_error_ns and at_ends is not None:
-            starts, ends = self.apply(at_ends)
-            F[:, :, self.of_velocity - 1] = (
-                starts @ Ad[0].T - (Ad_at_ends @ ends[:, :, None])[:, :, 0]
-            )
-        return F
-
-    def _shares(self, held: HeldVelocities) -> FloatArray:
-        """Return (k, 1, …) half of how far each scale and bias moves the robot in a piece."""
-        rates = self._rates(held.body_velocities)
-        shares: FloatArray = (0.5 * rates * held.dt_s[:, None])[:, None, :]
-        return shares
 
     def _rates(self, measured_velocities: FloatArray) -> FloatArray:
         """Return (k, …) how fast each entry of [M b] moves the robot per unit of its error."""

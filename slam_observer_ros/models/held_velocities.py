@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+
+
+class Velocities(NamedTuple):
+    """Velocities of one or two sensors, each in force from its stamp to the next.
+
+    Columns of two are of the angular and the linear part.
+    """
+
+    stamps_ns: IntArray  # (r,)
+    body_velocities: FloatArray  # (r, 6)
+    since_ns: IntArray  # (r, 2) stamps of the messages that they are of
+    is_stated: BoolArray  # (r, 2) whether a message stated its covariance
+    covariances: FloatArray  # (r, 6, 6) as stated, zero where unknown
+    usual_angular_s: float  # how long one is held as a rule
+    usual_linear_s: float
+    timeout_ns: int  # how long one is held at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,60 +53,35 @@ class HeldVelocities:
             usual_s=np.full(2, np.inf),
         )
 
-    @property
-    def piece_counts(self) -> IntArray:
-        """(k,) 2 for pieces that have a gap beside time with a velocity, 1 for others."""
-        return 1 + ((self.gap_s > 0.0) & (self.dt_s > 0.0))
 
-    def with_gaps_apart(self) -> HeldVelocities:
-        """Return the same with each gap as a piece of its own."""
-        rows = np.repeat(np.arange(len(self.dt_s)), self.piece_counts)
-        is_gap = np.append(False, rows[1:] == rows[:-1]) | (self.dt_s[rows] == 0.0)
-        return HeldVelocities(
-            body_velocities=self.body_velocities[rows],
-            covariances=self.covariances[rows],
-            is_stated=self.is_stated[rows],
-            dt_s=np.where(is_gap, 0.0, self.dt_s[rows]),
-            gap_s=np.where(is_gap, self.gap_s[rows], 0.0),
-            before_s=self.before_s[rows],
-            usual_s=self.usual_s,
-        )
+def held(velocities: Velocities, start_ns: int, end_ns: int) -> HeldVelocities:
+    """Return the velocities in force from one stamp to another.
 
-    def as_usual(self, usual_s: FloatArray) -> HeldVelocities:
-        """Return the same, as when velocities were held for ``usual_s`` (2,) as a rule."""
-        return replace(self, usual_s=usual_s)
-
-
-@dataclass(frozen=True, slots=True)
-class HeldUntil:
-    """Velocities that are held from one instant to each of s others, as they were known then.
-
-    Until each of these there are the first of k pieces, and a last one that it ends in.
+    A gap, which begins where a velocity has timed out, is a piece of its own.
     """
-
-    whole: HeldVelocities  # (k)
-    last: HeldVelocities  # (s)
-    counts: IntArray  # (s,) how many of the whole pieces there are before the last one
-    usual_s: FloatArray  # (s, 2) how long velocities were held as a rule, as known then
-
-    @property
-    def has_gaps(self) -> bool:
-        """Whether there is time in which no velocity is known."""
-        return bool(self.whole.gap_s.any() or self.last.gap_s.any())
-
-    def until(self, row: int) -> HeldVelocities:
-        """Return all pieces until one of the instants."""
-        count = self.counts[row]
-        joined = {
-            field.name: np.append(
-                getattr(self.whole, field.name)[:count],
-                getattr(self.last, field.name)[row : row + 1],
-                axis=0,
-            )
-            for field in fields(HeldVelocities)
-            if field.name != 'usual_s'
-        }
-        return HeldVelocities(**joined, usual_s=self.usual_s[row])
+    first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
+    last = max(int(velocities.stamps_ns.searchsorted(end_ns, 'left')), first + 1)
+    bounds_ns = np.append(velocities.stamps_ns[first:last], end_ns)
+    bounds_ns[0], since_ns = start_ns, velocities.since_ns[first:last]
+    rows: slice | IntArray = slice(first, last)
+    dt_ns, before_s = np.diff(bounds_ns), to_s(bounds_ns[:-1, None] - since_ns)
+    gap_ns = np.maximum(bounds_ns[1:] - since_ns[:, 1] - velocities.timeout_ns, 0)
+    if np.count_nonzero(gap_ns):  # seldom
+        gap_ns = np.minimum(gap_ns, dt_ns)
+        piece = np.repeat(np.arange(last - first), 1 + ((gap_ns > 0) & (gap_ns < dt_ns)))
+        is_gap = np.append(False, piece[1:] == piece[:-1]) | (gap_ns == dt_ns)[piece]
+        rows, before_s = first + piece, before_s[piece]
+        dt_ns = np.where(is_gap, 0, (dt_ns - gap_ns)[piece])
+        gap_ns = np.where(is_gap, gap_ns[piece], 0)
+    return HeldVelocities(
+        body_velocities=velocities.body_velocities[rows],
+        covariances=velocities.covariances[rows],
+        is_stated=velocities.is_stated[rows],
+        dt_s=to_s(dt_ns),
+        gap_s=to_s(gap_ns),
+        before_s=before_s,
+        usual_s=np.array([velocities.usual_angular_s, velocities.usual_linear_s]),
+    )
 
 
 def averaged(body_velocities: FloatArray, dt_s: FloatArray, window_s: float) -> FloatArray:

@@ -84,6 +84,7 @@ class MotionFigures(NamedTuple):
     densities: FloatArray  # (6,) variances of the motion per second, rad² and m²
     scales: FloatArray  # (6,) the same in proportion to the mean velocity, its square root
     factors: FloatArray  # (2,) of both, for turning and driving
+    unknown: FloatArray  # (6,) variances per second of a motion without a velocity, rad² and m²
 
 
 class Factors(NamedTuple):
@@ -109,7 +110,6 @@ class MotionNoise:
             np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3) ** 2
         )
         self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
-        self._has_scale = bool(self._scale.any())
 
     def copy(self) -> MotionNoise:
         """Return an independent copy."""
@@ -127,7 +127,7 @@ class MotionNoise:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         # In a gap the robot may do anything that is allowed.
         if np.count_nonzero(held.gap_s):
-            variances += np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
+            variances += gap_variances(held.gap_s, self.figures)
         covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
         if some_are_stated:  # of angular and linear part one may have none
             covariances += stated_motion_covariances(
@@ -140,12 +140,7 @@ class MotionNoise:
         """How far velocities without a stated covariance may be off now."""
         s = self._settings
         densities = _squares(s.angular_velocity_noise, s.linear_velocity_noise)
-        return MotionFigures(densities, self._scale, self.factors.applied)
-
-    def is_summed(self, held: HeldVelocities) -> bool:
-        """Return whether what one motion may be off by does not depend on others."""
-        last_longer = _some_last_longer(held.before_s + held.dt_s[:, None], held.usual_s)
-        return not (self._has_scale or last_longer)
+        return MotionFigures(densities, self._scale, self.factors.applied, self._unknown_squared)
 
     def velocity_covariance(self, held: HeldVelocities) -> FloatArray:
         """Return what a single velocity may be off by: (6, 6), rad²/s² and m²/s²."""
@@ -183,6 +178,12 @@ def motion_variances(
         variances += (figures.scales * averaged(V, dt_s, SPEED_WINDOW_S)) ** 2 * dt_s[:, None]
     grown: FloatArray = variances * figures.factors.repeat(3)
     return grown
+
+
+def gap_variances(gap_s: FloatArray, figures: MotionFigures) -> FloatArray:
+    """Return the variances (k, 6) of motions in time without a velocity: any that is allowed."""
+    variances: FloatArray = np.minimum(figures.unknown * gap_s[:, None], MAX_GAP_ERRORS**2)
+    return variances
 
 
 def stated_motion_covariances(

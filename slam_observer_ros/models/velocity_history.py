@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 import math
 from statistics import median_low
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.models.held_velocities import HeldUntil, HeldVelocities
+from slam_observer_ros.models.held_velocities import held, HeldVelocities, Velocities
 
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
 """Stamp of a velocity that timed out before time began, nanoseconds."""
@@ -51,22 +51,6 @@ observations would weigh so much that smoothing had no digits left for what is s
 
 FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
-
-
-class Velocities(NamedTuple):
-    """Velocities of one or two sensors, each in force from its stamp to the next.
-
-    Columns of two are of the angular and the linear part.
-    """
-
-    stamps_ns: IntArray  # (r,)
-    body_velocities: FloatArray  # (r, 6)
-    since_ns: IntArray  # (r, 2) stamps of the messages that they are of
-    is_stated: BoolArray  # (r, 2) whether a message stated its covariance
-    covariances: FloatArray  # (r, 6, 6) as stated, zero where unknown
-    usual_angular_s: float  # how long one is held as a rule
-    usual_linear_s: float
-    timeout_ns: int  # how long one is held at most
 
 
 class VelocityHistory:
@@ -224,64 +208,13 @@ class VelocityHistory:
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
-        held = self._held(self._pieces(start_ns, end_ns))
-        return held.with_gaps_apart() if np.count_nonzero(held.gap_s) else held
-
-    def held_until(self, start_ns: int, stamps_ns: IntArray, delay_ns: int) -> HeldUntil:
-        """Return what led from ``start_ns`` to increasing stamps (s,), ``delay_ns`` before each.
-
-        As :meth:`held` would have it, had it been asked at each stamp, which is one of a velocity.
-        """
-        start_ns, ends_ns = start_ns - delay_ns, stamps_ns - delay_ns
-        stamps, first, known = self._known_at(stamps_ns, start_ns)
-        # Of what was known then, the velocity that each instant is in; others before are whole.
-        counts: IntArray = np.minimum(stamps.searchsorted(ends_ns) - 1, known)
-        begins, k = np.maximum(stamps, start_ns), counts[-1]
-        return HeldUntil(
-            whole=self._held(self._cut(slice(first, first + k), begins[:k], begins[1 : k + 1])),
-            last=self._held(self._cut(first + counts, begins[counts], ends_ns)),
-            counts=counts,
-            usual_s=self._joined.usual_s[first + known],
-        )
-
-    def means_until(self, centres_ns: IntArray, reach_ns: int, stamps_ns: IntArray) -> FloatArray:
-        """Return :meth:`mean` around centres (s,), had it been asked at increasing stamps (s,)."""
-        starts_ns, ends_ns = centres_ns - reach_ns, centres_ns + reach_ns
-        stamps, first, known = self._known_at(stamps_ns, int(starts_ns.min()))
-        joined = self._joined
-        velocities = self._counting(joined.body_velocities[first : first + len(stamps)])
-        stops = joined.since_ns[first : first + len(stamps), 1] + self._timeout_ns
-        # How long a velocity was known, and how far it led, until each of their stamps, …
-        known_s = to_s(np.maximum(np.minimum(stops[:-1], stamps[1:]) - stamps[:-1], 0))
-        until = np.zeros((len(stamps), 7))
-        pieces = np.column_stack([known_s[:, None] * velocities[:-1], known_s])
-        np.cumsum(pieces, axis=0, out=until[1:])
-        # … and until any time, with the last one before it held until then.
-        sums = np.zeros((2, len(stamps_ns), 7))
-        for of_each, times in zip(sums, (starts_ns, ends_ns), strict=True):
-            rows = np.minimum(stamps.searchsorted(times, 'right') - 1, known)
-            since_s = to_s(np.maximum(np.minimum(stops[rows], times) - stamps[rows], 0))
-            of_each[:] = until[rows]
-            of_each[:, :6] += since_s[:, None] * velocities[rows]
-            of_each[:, 6] += since_s
-        motions, lengths_s = np.split(sums[1] - sums[0], [6], axis=1)
-        means: FloatArray = motions / np.where(lengths_s > 0.0, lengths_s, np.inf)
-        return means
+        found = held(self.flat(), start_ns, end_ns)
+        return replace(found, body_velocities=self._counting(found.body_velocities))
 
     def between(self, start_ns: int, end_ns: int) -> tuple[IntArray, FloatArray]:
         """Return stamps and measured velocities (m, 6) of those in force between two stamps."""
         rows = slice(max(self._row(start_ns) - 1, 1), self._row(end_ns))
         return self._joined.stamps_ns[rows], self._joined.body_velocities[rows]
-
-    def _known_at(self, stamps_ns: IntArray, start_ns: int) -> tuple[IntArray, int, IntArray]:
-        """Return stamps of velocities, the row of the first, and which was the latest at each.
-
-        From the one in force at ``start_ns`` on, or known at the first of ``stamps_ns`` (s,).
-        """
-        earliest_ns, latest_ns = min(start_ns, int(stamps_ns[0])), int(stamps_ns[-1])
-        first = self._row(earliest_ns) - 1
-        stamps = self._joined.stamps_ns[first : self._row(latest_ns)]
-        return stamps, first, stamps.searchsorted(stamps_ns, 'right') - 1
 
     def flat(self) -> Velocities:
         """Return all that are known as plain arrays."""
@@ -309,15 +242,6 @@ class VelocityHistory:
             self._timeout_ns,
         )
 
-    def mean(self, start_ns: int, end_ns: int) -> FloatArray:
-        """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
-        pieces = self._pieces(start_ns, end_ns)
-        held_ns = (pieces.stops_ns - pieces.begins_ns).astype(np.float64)
-        known_ns = held_ns.sum()
-        if known_ns == 0.0:
-            return np.zeros(6)
-        return self._counting(held_ns.dot(self._joined.body_velocities[pieces.rows]) / known_ns)
-
     @property
     def begins_ns(self) -> int | None:
         """Stamp since which velocities are known, nanoseconds; None while there are none."""
@@ -330,32 +254,6 @@ class VelocityHistory:
             kept = np.append(0, np.arange(first, count))
             self._joined = self._joined.copied(kept, len(self._joined.stamps_ns))
             self._count = len(kept)
-
-    def _held(self, pieces: _Pieces) -> HeldVelocities:
-        rows, begins_ns, stops_ns, ends_ns = pieces
-        joined = self._joined
-        before_ns = begins_ns[:, None] - joined.since_ns[rows]
-        dt_s, gap_s, *before_s = to_s(
-            np.array([stops_ns - begins_ns, ends_ns - stops_ns, *before_ns.T])
-        )
-        return HeldVelocities(
-            body_velocities=self._counting(joined.body_velocities[rows]),
-            covariances=joined.covariances[rows],
-            is_stated=joined.is_stated[rows],
-            dt_s=dt_s,
-            gap_s=gap_s,
-            before_s=np.array(before_s).T,
-            usual_s=np.array(self._usual_s()),
-        )
-
-    def _pieces(self, start_ns: int, end_ns: int) -> _Pieces:
-        first, last = self._row(start_ns) - 1, self._row(end_ns, 'left')
-        stamps: IntArray = np.append(self._joined.stamps_ns[first:last], end_ns)
-        return self._cut(slice(first, last), np.maximum(stamps[:-1], start_ns), stamps[1:])
-
-    def _cut(self, rows: slice | IntArray, begins: IntArray, ends: IntArray) -> _Pieces:
-        timed_out = self._joined.since_ns[rows, 1] + self._timeout_ns
-        return _Pieces(rows, begins, np.minimum(np.maximum(timed_out, begins), ends), ends)
 
     def _usual_s(self) -> tuple[float, float]:
         linear_s = self._periods.usual_s
@@ -411,15 +309,6 @@ class _Periods:
         if len(longest_ns) == 2:
             self._usual_ns = longest_ns[0]
             self.usual_s = to_s(longest_ns[0]) or math.inf
-
-
-class _Pieces(NamedTuple):
-    """Rows of velocities in force, and when each begins, times out and ends."""
-
-    rows: slice | IntArray
-    begins_ns: IntArray
-    stops_ns: IntArray
-    ends_ns: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,12 +12,12 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import POINT
 from slam_observer_ros.filter.arrays import SeenOrientations
+from slam_observer_ros.filter.flat_arrays import Advanced
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import EstimatedAxes
 from slam_observer_ros.lie.matrices import transpose
 from slam_observer_ros.lie.sensor_mounting import joined_sensed, Sensed
 from slam_observer_ros.models.calibration import Calibration
-from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.smoothing.keyframes import (
     joined,
@@ -97,15 +97,16 @@ class _Link(NamedTuple):
     sensitivity: FloatArray
     drift: FloatArray
     calibration: FloatArray
-    slip: Motion | None  # after it, if the robot was taken for slipped
+    # The pose (4, 4) after it, and noise (p, p), if the robot was taken for slipped
+    slip: tuple[FloatArray, FloatArray] | None
 
     @property
     def with_slip(self) -> list[_Link]:
         """The same with the slip as a part of the motion; none if there was none."""
-        slip = self.slip
-        if slip is None:
+        if self.slip is None:
             return []
-        return [self._replace(end=slip.path[-1], noise=self.noise + slip.noise)]
+        end, noise = self.slip
+        return [self._replace(end=end, noise=self.noise + noise)]
 
 
 class History:
@@ -128,7 +129,7 @@ class History:
         self._calibration = prior.calibration
         self._start: FloatArray | None = None
         self._end = prior.pose
-        self._slip: Motion | None = None
+        self._slip: tuple[FloatArray, FloatArray] | None = None
         # Noise, sensitivity and drift of the motion since the last keyframe; None if at rest.
         self._motion: _Motion | None = None
         # Keyframes as arrays: the summarised ones, in pieces, and the others.
@@ -148,36 +149,32 @@ class History:
                 setattr(other, name, value.copy())
         return other
 
-    def move(self, motion: Motion) -> None:
-        """Append a motion to the one that leads to the next keyframe; a slip comes last."""
-        self.begin(motion.path[0])
-        if motion.is_slip:
-            self._slip = motion
-            return
-        end, noise, sensitivity = motion.path[-1], motion.noise, motion.sensitivity
-        self.move_on(end, noise, sensitivity, motion.drift, motion.calibration)
-
-    def move_on(
-        self,
-        end: FloatArray,
-        noise: FloatArray,
-        sensitivity: FloatArray,
-        drift: FloatArray,
-        calibration: Calibration,
+    def move(
+        self, start: FloatArray, motion: Advanced, drift: FloatArray, calibration: Calibration
     ) -> None:
-        """Append a motion to a pose ``end`` (4, 4), with what :class:`.Motion` has of it."""
-        self._end = end.copy()  # not a view, which would keep all of a path
-        before = self._motion
+        """Append a motion from a pose (4, 4) to the one that leads to the next keyframe.
+
+        In its time the covariance of the calibration grows by ``drift`` (c, c).
+        """
+        if self._start is None:
+            self._start = start.copy()
+        self._end, before = motion.A, self._motion
         if before is None:
-            self._motion = noise.copy(), sensitivity.copy(), drift.copy()
+            self._motion = motion.noise, motion.sensitivity, drift
         else:
-            self._motion = before[0] + noise, before[1] + sensitivity, before[2] + drift
+            noise, sensitivity, drift_before = before
+            self._motion = (
+                noise + motion.noise,
+                sensitivity + motion.sensitivity,
+                drift_before + drift,
+            )
         self._calibration = calibration.values
 
-    def begin(self, pose: FloatArray) -> None:
-        """Note the pose (4, 4) from where the motion to the next keyframe begins."""
+    def slip(self, start: FloatArray, motion: Advanced) -> None:
+        """Note a slip from a pose (4, 4); it comes last before the next keyframe."""
         if self._start is None:
-            self._start = self._end = pose.copy()
+            self._start = self._end = start.copy()
+        self._slip = motion.A, motion.noise
 
     def add(self, keyframe: Keyframe, pose: FloatArray, calibration: FloatArray) -> None:
         """Append a keyframe seen from ``pose`` (4, 4); ``calibration`` (c,) is as known then."""

@@ -29,13 +29,13 @@ import numpy as np
 from slam_observer_ros.common.errors import ParameterError, SmoothingError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.filter.flat_arrays import Advanced
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.observer import Observer
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import EstimatedAxes
 from slam_observer_ros.lie.sensor_mounting import MEASURED
 from slam_observer_ros.models.calibration import Calibration
-from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
@@ -124,18 +124,11 @@ class Past:
     def reset(self, since: str) -> None:
         """Begin a new history with the present estimate; ``since`` says why, in words."""
 
-    def move(self, motion: Motion) -> None:
-        """Note a motion of the robot."""
+    def move(self, start: FloatArray, motion: Advanced, duration_s: float) -> None:
+        """Note a motion of the robot from a pose (4, 4)."""
 
-    def move_on(
-        self,
-        start: FloatArray,
-        end: FloatArray,
-        noise: FloatArray,
-        sensitivity: FloatArray,
-        duration_s: float,
-    ) -> None:
-        """Note a motion from pose to pose (4, 4), with what :class:`.Motion` has of it."""
+    def slip(self, start: FloatArray, motion: Advanced) -> None:
+        """Note a slip from a pose (4, 4), which may not have happened."""
 
     def note_correction(self, before: FloatArray, after: FloatArray) -> None:
         """Note a correction that turned the robot from Â to another (4, 4)."""
@@ -219,29 +212,21 @@ class Relinearisation(Past):
         self._is_given_up = not self._is_dense
         self._start(self._known(), since)
 
-    def move(self, motion: Motion) -> None:
-        """Note a motion of the robot."""
+    def move(self, start: FloatArray, motion: Advanced, duration_s: float) -> None:
+        """Note a motion of the robot from a pose (4, 4)."""
         if not self.is_active:
             return
         if self._observer.have_moved and self._observer.u.any():
             # Their ways depend on how the robot was turned, which the smoother does not consider.
             self.reset('a landmark came with a velocity')
-        else:
-            self.history.move(motion)
+            return
+        drift = self._calibration.drift_covariance * duration_s
+        self.history.move(start, motion, drift, self._calibration)
 
-    def move_on(
-        self,
-        start: FloatArray,
-        end: FloatArray,
-        noise: FloatArray,
-        sensitivity: FloatArray,
-        duration_s: float,
-    ) -> None:
-        """Note a motion from pose to pose (4, 4), with what :class:`.Motion` has of it."""
+    def slip(self, start: FloatArray, motion: Advanced) -> None:
+        """Note a slip from a pose (4, 4), which may not have happened."""
         if self.is_active:
-            drift = self._calibration.drift_covariance * duration_s
-            self.history.begin(start)
-            self.history.move_on(end, noise, sensitivity, drift, self._calibration)
+            self.history.slip(start, motion)
 
     def note_correction(self, before: FloatArray, after: FloatArray) -> None:
         """Note a correction that turned the robot from Â to another (4, 4)."""

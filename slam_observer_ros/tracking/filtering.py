@@ -1,26 +1,21 @@
-"""A state packed into plain arrays for the filter (:mod:`.filter.step`), and what comes of it.
+"""An observation packed into plain arrays for the filter (:mod:`.filter.step`), and its effects.
 
 Of a large map only active landmarks are read; the landmarks seen have become active before.
-Motions along velocities with a gap are None here: :meth:`.State.motion` integrates them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter import core, step
 from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.flat_arrays import (
-    Advanced,
     FilterState,
-    Interval,
     Limits,
     Observed,
     Seen,
@@ -31,90 +26,11 @@ from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.sensor_mounting import Sensed
 from slam_observer_ros.models import sensing
-from slam_observer_ros.models.velocity_history import Velocities, VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
-from slam_observer_ros.tracking.covariances import of_pose
 from slam_observer_ros.tracking.matching import calibrated, sensitivity
 from slam_observer_ros.tracking.state import State
 
 _NO_ENTRIES, NO_IDS, _NO_POINTS = np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3))
-
-
-def advance(
-    state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
-) -> FloatArray | None:
-    """Move a state on between two stamps (27); return the variances (6,) of the motion by axis."""
-    joint = _at_rest(state)
-    if joint is None:
-        return None
-    x = _estimate(state, joint)
-    status, out = _advanced(state, x, velocities.flat(), start_ns, end_ns)
-    if status == step.UNUSUAL:
-        return None
-    joint.note_motion()
-    duration_s = to_s(end_ns - start_ns)
-    state.relinearisation.move_on(x.A, out.A, out.noise, out.sensitivity, duration_s)
-    of_driving = out.noise - out.of_turning
-    is_rest = status == step.AT_REST
-    state.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
-    x.A[...] = out.A
-    if state.calibration.delay_error_ns:
-        state.end_velocity = out.at_end
-    return out.variances
-
-
-def pose_after(
-    state: State, velocities: VelocityHistory, start_ns: int, end_ns: int
-) -> tuple[FloatArray, FloatArray | None] | None:
-    """As :meth:`.State.pose_after`."""
-    found = _led_to(state, [velocities.flat()], start_ns, [end_ns])
-    if found is None:
-        return None
-    (A,), (covariance,) = found
-    return _in_world(state, A, covariance)
-
-
-def poses_until(
-    state: State, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
-) -> tuple[FloatArray, FloatArray | None] | None:
-    """As :meth:`.State.poses_until`."""
-    known_then = velocities.flat_then(stamps_ns)
-    found = _led_to(state, known_then, start_ns, stamps_ns.tolist())
-    return None if found is None else _in_world(state, *found)
-
-
-def _led_to(
-    state: State, velocities: Sequence[Velocities], start_ns: int, ends_ns: Sequence[int]
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return Â (s, 4, 4) and covariances (s, 6, 6) of ε to which :func:`advance` would lead.
-
-    Until each instant along the velocities known then.
-    """
-    errors, axes = state.errors, state.axes
-    if errors is None or core.COMPILED is None:  # in numpy :meth:`.State.motion` costs less
-        return None
-    # Landmarks have no part in it.
-    now = errors.joint.of_robot
-    P, p, figures = now.copy(), axes.p, state.motion_noise.figures
-    x = _estimate(state, errors.joint)._replace(
-        y_ref=_NO_POINTS, a=_NO_POINTS, P=P, size=len(P), first=len(P)
-    )
-    A, covariances = np.empty((len(ends_ns), 4, 4)), np.zeros((len(ends_ns), 6, 6))
-    out = _room_for_motion(state)
-    for row, (known, end_ns) in enumerate(zip(velocities, ends_ns, strict=True)):
-        P[...] = now
-        interval = _interval(state, start_ns, end_ns)
-        if core.advance(x, known, interval, figures, out) == step.UNUSUAL:
-            return None
-        A[row], covariances[row, axes.pose, axes.pose] = out.A, P[:p, :p]
-    return A, covariances
-
-
-def _in_world(
-    state: State, A: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray | None]:
-    observer = state.observer
-    return observer.reference_pose @ A, of_pose(observer, covariance, A)
 
 
 class Corrected(NamedTuple):
@@ -138,9 +54,9 @@ def correct(
     joint.activate(known)
     places = np.full(len(rows), -1)
     places[rows >= 0] = joint.places(known)
-    x, seen = _estimate(state, joint), _seen(state, event, rows, places)
+    x, seen = state.gains.flat(), _seen(state, event, rows, places)
     settings, columns = state.settings, state.landmarks.columns
-    in_arrays = _in_arrays(state, joint)
+    in_arrays = slice(None) if state.observer.is_exact else joint.active
     landmarks = Landmarks(*[column[in_arrays] for column in columns])
     factors = state.motion_noise.factors.flat() if len(known) else None
     out, noise = _room(state, event, x.size), state.observation_noise
@@ -218,68 +134,6 @@ def _take_over(state: State, joint: JointCovariance, x: FilterState, out: Observ
         if chart.velocity:
             change = axes.full_points(of_landmarks[:, -chart.velocity :])
             observer.correct_velocities(out.A @ se3.inverse(before), moved, change)
-
-
-def _at_rest(state: State) -> JointCovariance | None:
-    """Return P, where landmarks are at rest."""
-    errors = state.errors
-    if errors is None or errors.joint.chart.velocity or state.observer.have_moved:
-        return None
-    return errors.joint
-
-
-def _in_arrays(state: State, joint: JointCovariance) -> IntArray | slice:
-    """Return which landmarks the filter is given: those in P, all of an exact map."""
-    return slice(None) if state.observer.is_exact else joint.active
-
-
-def _estimate(state: State, joint: JointCovariance) -> FilterState:
-    """Return the estimate as plain arrays."""
-    observer, matrix, rows = state.observer, joint._matrix, _in_arrays(state, joint)
-    return FilterState(
-        observer.A,
-        observer.y_ref[rows],
-        observer.a[rows],
-        matrix._storage,
-        matrix._size,
-        joint.first,
-        0 if observer.is_exact else joint.chart.stride,
-        state.settings.two_d_mode,
-        state.calibration.rates,
-        state.calibration.velocity_places,
-        state.calibration.drift_covariance,
-    )
-
-
-def _advanced(
-    state: State, x: FilterState, velocities: Velocities, start_ns: int, end_ns: int
-) -> tuple[int, Advanced]:
-    """Move ``x`` on along velocities (27); return whether that was usual, and what it did."""
-    interval, out = _interval(state, start_ns, end_ns), _room_for_motion(state)
-    return core.advance(x, velocities, interval, state.motion_noise.figures, out), out
-
-
-def _interval(state: State, start_ns: int, end_ns: int) -> Interval:
-    calibration = state.calibration
-    return Interval(
-        start_ns,
-        end_ns,
-        calibration.delay_ns,
-        calibration.delay_error_ns,
-        state.end_velocity,
-    )
-
-
-def _room_for_motion(state: State) -> Advanced:
-    p, c = state.axes.p, state.calibration.count
-    return Advanced(
-        np.empty((4, 4)),
-        np.empty((p, p)),
-        np.empty((p, p)),
-        np.empty((p, c)),
-        np.empty(6),
-        np.empty(6),
-    )
 
 
 def _seen(state: State, event: ObservationEvent, rows: IntArray, places: IntArray) -> Seen:

@@ -30,9 +30,8 @@ from slam_observer_ros.estimates import (
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import cholesky, mahalanobis, transpose
-from slam_observer_ros.models.integration import DelayEvidence
+from slam_observer_ros.models.velocity_delay import DelayEvidence
 from slam_observer_ros.models.velocity_history import VelocityHistory
-from slam_observer_ros.tracking import filtering
 from slam_observer_ros.tracking.costs import NewLandmarks
 from slam_observer_ros.tracking.covariances import of_pose
 from slam_observer_ros.tracking.hypothesis import Hypothesis, Twins
@@ -177,12 +176,10 @@ class Hypotheses:
 
         Hypotheses are moved on from ``start_ns``, and the most likely one may be wrong.
         """
-        of_each = [
-            filtering.pose_after(one.state, velocities, start_ns, end_ns)
-            or one.state.pose_after(velocities, start_ns, end_ns)
-            for one in self._all
-        ]
-        return of_each[0][0], self._mixed(of_each)
+        known = [velocities.flat()]
+        of_each = [state.poses_until(known, start_ns, [end_ns]) for state in self.states]
+        covariance = self._mixed(of_each)
+        return of_each[0][0][0], None if covariance is None else covariance[0]
 
     def poses_until(
         self,
@@ -193,17 +190,12 @@ class Hypotheses:
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return the most likely poses (s, 4, 4) at stamps (s,), and their covariances (s, 6, 6).
 
-        As :meth:`.State.poses_until` of each hypothesis.
+        As :meth:`.State.poses_until` of each hypothesis, along velocities known then.
         """
-        if not with_covariances:
-            passage = self.best.passage(velocities, start_ns, stamps_ns, with_covariances)
-            return self.best.observer.reference_pose @ passage.poses, None
-        of_each = [
-            filtering.poses_until(one.state, velocities, start_ns, stamps_ns)
-            or one.state.poses_until(velocities, start_ns, stamps_ns)
-            for one in self._all
-        ]
-        return of_each[0][0], self._mixed(of_each)
+        known, stamps = velocities.flat_then(stamps_ns), stamps_ns.tolist()
+        states = self.states if with_covariances else [self.best]
+        of_each = [state.poses_until(known, start_ns, stamps) for state in states]
+        return of_each[0][0], self._mixed(of_each) if with_covariances else None
 
     def _mixed(self, of_each: Sequence[tuple[FloatArray, FloatArray | None]]) -> FloatArray | None:
         """Return the covariance (…, 6, 6) of the first pose (…, 4, 4), by all hypotheses.
@@ -256,16 +248,12 @@ class Hypotheses:
 
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
-        stood_s = velocities.stood_s(end_ns)
+        stood_s, flat = velocities.stood_s(end_ns), velocities.flat()
         for hypothesis in self._all:
             state = hypothesis.state
             state.observation_noise.stood_s = stood_s
             before = state.observer.A.copy()
-            variances = filtering.advance(state, velocities, start_ns, end_ns)
-            if variances is None:
-                motion = state.motion(velocities, start_ns, end_ns)
-                state.propagate(motion)
-                variances = np.diagonal(motion.covariances.sum(axis=0))
+            variances = state.advance(flat, start_ns, end_ns)
             if state is not self.best:
                 continue
             self._standing.moved.append(se3.between(before, state.observer.A))

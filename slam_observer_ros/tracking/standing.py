@@ -28,7 +28,6 @@ from slam_observer_ros.lie.matrices import (
     transpose,
     with_blocks,
 )
-from slam_observer_ros.models.integration import integrate
 from slam_observer_ros.models.observation_noise import repetition_factors
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.tracking import covariances
@@ -234,11 +233,11 @@ def product(moved: list[FloatArray]) -> FloatArray:
 
 def _motion_noise(state: State, pairs: SeenTwice, velocities: VelocityHistory) -> FloatArray:
     """Return the covariance (p, p) of the motion between them, its bias included."""
-    calibration, end_ns = state.calibration, pairs.event.stamp_ns
+    end_ns = pairs.event.stamp_ns
     # The velocities before are forgotten: they were off by as much.
     since_ns = max(pairs.since_ns, velocities.begins_ns or pairs.since_ns)
     start = state.observer.A.dot(se3.inverse(pairs.motion))
-    motion = integrate(velocities, calibration, state.motion_noise, start, since_ns, end_ns, None)
+    motion = state.effect(start, velocities.flat(), since_ns, end_ns)
     longer = (end_ns - pairs.since_ns) / max(end_ns - since_ns, 1)
     F = longer * motion.sensitivity
     # As it is stated: slips and carried landmarks themselves have made the factor larger.

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import Change, NormalisedInnovation, Outcomes, Smoothed, Update
+from slam_observer_ros.filter.flat_arrays import Advanced, Interval
 from slam_observer_ros.filter.gains import Errors, Gains
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import lyapunov
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.matrices import correlations_of
-from slam_observer_ros.models.integration import integrate, integrate_until
-from slam_observer_ros.models.motion import Motion, Passage
+from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
-from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
@@ -95,84 +96,49 @@ class State:
             return None
         return covariances.of_configuration(self.observer, self.axes, rows, P)
 
-    def pose_after(
-        self, velocities: VelocityHistory, start_ns: int, end_ns: int
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the pose (4, 4) at ``end_ns``, body to world, and its covariance (6, 6).
-
-        Of its rotation vector and position, along the world's axes, rad² and m²; None if unknown.
-        """
-        motion = self.motion(velocities, start_ns, end_ns)
-        A = motion.path[-1]
-        return self.observer.reference_pose @ A, self._pose_covariance(motion, A)
-
     def poses_until(
-        self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
+        self, velocities: Sequence[Velocities], start_ns: int, stamps_ns: Sequence[int]
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then."""
-        passage = self.passage(velocities, start_ns, stamps_ns, with_covariances=True)
-        A = passage.poses
-        return self.observer.reference_pose @ A, self._pose_covariance(passage, A)
+        """Return the poses (s, 4, 4) at stamps, body to world, and their covariances (s, 6, 6).
 
-    def _pose_covariance(self, motion: Motion | Passage, A: FloatArray) -> FloatArray | None:
+        Each along other velocities since the state's stamp ``start_ns``. Covariances are of
+        rotation vectors and positions, along the world's axes, rad² and m²; None if unknown.
+        """
+        intervals = [self._interval(start_ns, stamp_ns) for stamp_ns in stamps_ns]
+        A, of_errors = self.gains.led_to(velocities, intervals)
+        poses = self.observer.reference_pose @ A
         if self.errors is None:
-            return None
-        return covariances.of_pose(self.observer, self.errors.pose_covariance(motion), A)
+            return poses, None
+        return poses, covariances.of_pose(self.observer, of_errors, A)
 
-    def passage(
-        self,
-        velocities: VelocityHistory,
-        start_ns: int,
-        stamps_ns: IntArray,
-        with_covariances: bool,
-    ) -> Passage:
-        """Return how the robot moves from the state's stamp through ``stamps_ns`` (s,)."""
-        return integrate_until(
-            velocities,
-            self.calibration,
-            self.motion_noise,
-            self.observer.A,
-            start_ns,
-            stamps_ns,
-            self.end_velocity,
-            with_covariances,
-        )
+    def effect(
+        self, A: FloatArray, velocities: Velocities, start_ns: int, end_ns: int
+    ) -> Advanced:
+        """Return the effect of a motion between two stamps from Â = ``A`` (4, 4), not made."""
+        interval = self._interval(start_ns, end_ns)._replace(at_start=None)
+        return self.gains.effect(A, velocities, interval)
 
-    def motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
-        """Return how the robot moves from the state's stamp ``start_ns`` to ``end_ns``."""
-        return integrate(
-            velocities,
-            self.calibration,
-            self.motion_noise,
-            self.observer.A,
-            start_ns,
-            end_ns,
-            self.end_velocity,
-        )
+    def _interval(self, start_ns: int, end_ns: int) -> Interval:
+        calibration = self.calibration
+        delays_ns = calibration.delay_ns, calibration.delay_error_ns
+        return Interval(start_ns, end_ns, *delays_ns, self.end_velocity)
 
-    def propagate(self, motion: Motion) -> None:
-        """Move on along a motion (27)."""
-        self.gains.advance(motion)
-        self.relinearisation.move(motion)
-        if motion.at_ends is not None:
-            self.end_velocity = motion.at_ends[1]
+    def advance(self, velocities: Velocities, start_ns: int, end_ns: int) -> FloatArray:
+        """Move on between two stamps (27); return the variances (6,) of the motion by axis."""
+        before = self.observer.A.copy()
+        motion = self.gains.advance(velocities, self._interval(start_ns, end_ns))
+        self.relinearisation.move(before, motion, to_s(end_ns - start_ns))
+        if self.calibration.delay_error_ns:
+            self.end_velocity = motion.at_end
+        return motion.variances
 
     def slip(self, after: FloatArray, covariance: FloatArray) -> None:
         """Let the robot be at Â = ``after`` (4, 4), by a motion that odometry has not seen.
 
         Its ``covariance`` (6, 6) is in the body frame there, rad² and m².
         """
-        motion = Motion(
-            path=np.array([self.observer.A, after, after]),
-            measured_velocities=np.zeros((2, 6)),
-            dt_s=np.zeros(2),
-            covariances=np.array([np.zeros((6, 6)), covariance]),
-            duration_s=0.0,
-            at_ends=None,
-            calibration=self.calibration,
-            is_slip=True,
-        )
-        self.propagate(motion)
+        before = self.observer.A.copy()
+        self.relinearisation.slip(before, self.gains.slip(after, covariance))
 
     def update(
         self,
@@ -199,7 +165,7 @@ class State:
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot to ``pose`` (4, 4), body to world, uncorrelated with the map from now on.
 
-        ``covariance`` (6, 6) is as of :meth:`pose_after`; None for an exact pose.
+        ``covariance`` (6, 6) is as of :meth:`poses_until`; None for an exact pose.
         """
         observer = self.observer
         if not len(self.landmarks):

@@ -117,7 +117,7 @@ def test_the_gauge_is_exactly_in_the_null_space_of_the_output_matrix(rng):
 def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     pieces, dt_s = 20, 0.01
     V = rng.normal(size=(pieces, 6))
-    Q = random_covariances(rng, pieces, 6)
+    Q = 1e-2 * random_covariances(rng, pieces, 6)
     riccati = RiccatiGains(PLAIN, np.eye(4))
     riccati.observer.A[...] = start = se3.exp(rng.normal(size=6))
     propagate(riccati, V, np.full(pieces, dt_s), Q)

@@ -87,7 +87,7 @@ def test_riccati_filter_is_the_right_invariant_ekf(rng):
     """Over random motions, observations, new landmarks and ones that are placed again."""
     riccati, ekf = RiccatiGains(PLAIN, np.eye(4)), RightInvariantEkf()
     for number in range(30):
-        V, dt_s = rng.normal(size=(2, 6)), rng.uniform(0.05, 0.2, 2)
+        V, dt_s = rng.normal(size=(2, 6)), rng.integers(50, 200, 2) / 1000.0
         Q = 1e-3 * random_covariances(rng, 2, 6)
         propagate(riccati, V, dt_s, Q)
         ekf.move(V * dt_s[:, None], Q)

@@ -7,10 +7,10 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.constant import ConstantGains
+from slam_observer_ros.filter.flat_arrays import Advanced, Interval
 from slam_observer_ros.filter.gains import Gains
 from slam_observer_ros.filter.observer import Residuals
-from slam_observer_ros.lie import se3
-from slam_observer_ros.models.motion import Motion
+from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking.filtering import correct
@@ -22,6 +22,7 @@ PLAIN = Settings(
     relinearization_interval=0,
     angular_bias_stddev=(0.0, 0.0, 0.0),
     velocity_delay_stddev=0.0,
+    motion_noise_factor='stated',
 )
 """No robustness, no relinearising, no calibration: a plain filter."""
 
@@ -29,17 +30,37 @@ DT_S = 0.1
 """Time between two observations of each landmark."""
 
 
+def held(
+    body_velocities: FloatArray, dt_s: FloatArray, covariances: FloatArray | None = None
+) -> Velocities:
+    """Velocities (k, 6), held for ``dt_s`` (k,) from stamp 0 on, motions of covariances (k, 6, 6).
+
+    Without covariances they are as noisy as the settings say. The first one was known before.
+    """
+    ends_ns, k = np.cumsum(np.rint(dt_s * 1e9)).astype(np.int64), len(dt_s)
+    since_ns = np.append(0, ends_ns[:-1])
+    stated = np.zeros((k, 6, 6))
+    if covariances is not None:
+        stated = covariances / dt_s[:, None, None] ** 2
+    return Velocities(
+        stamps_ns=np.append(-(10**12), since_ns[1:]),
+        body_velocities=body_velocities,
+        since_ns=np.repeat(since_ns[:, None], 2, axis=1),
+        is_stated=np.full((k, 2), covariances is not None),
+        covariances=stated,
+        usual_angular_s=np.inf,
+        usual_linear_s=np.inf,
+        timeout_ns=2 * int(ends_ns[-1]),
+    )
+
+
 def propagate(
     filter_: Gains, body_velocities: FloatArray, dt_s: FloatArray, covariances: FloatArray
-) -> None:
+) -> Advanced:
     """Move along velocities (k, 6), held for ``dt_s`` (k,), motions of covariances (k, 6, 6)."""
-    calibration = filter_.calibration
-    V = calibration.apply(body_velocities)
-    path = se3.path(filter_.observer.A, V * dt_s[:, None])
-    duration_s, at_ends = float(dt_s.sum()), np.zeros((2, 6))
-    filter_.advance(
-        Motion(path, body_velocities, dt_s, covariances, duration_s, at_ends, calibration)
-    )
+    end_ns = int(np.rint(dt_s * 1e9).sum())
+    velocities = held(body_velocities, dt_s, covariances)
+    return filter_.advance(velocities, Interval(0, end_ns, 0, 0, None))
 
 
 def residuals_of(

@@ -15,9 +15,10 @@ from slam_observer_ros.filter.flat_arrays import (
 )
 from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.lie import se3
+from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.motion_noise import Factors, MotionFigures
 from slam_observer_ros.models.observation_noise import PointFigures
-from slam_observer_ros.models.velocity_history import NEVER_NS, Velocities
+from slam_observer_ros.models.velocity_history import NEVER_NS
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_700_000_000 * SECOND_NS
@@ -48,7 +49,9 @@ def random_estimate(rng, n=None, of_tags=False, is_exact=False):
         A = se3.flatten(A)
         y_ref[:, 2] = a[:, 2] = 0.0
     drift = np.diag(rng.uniform(0.0, 1e-6, c)) * rng.integers(2)
-    return FilterState(A, y_ref, a, P, size, first, stride, is_planar, rates, estimated, drift)
+    return FilterState(
+        A, y_ref, a, P, size, first, stride, is_planar, rates, estimated, drift, None
+    )
 
 
 def random_motion(rng):
@@ -74,7 +77,9 @@ def random_motion(rng):
     reach_ns = int(rng.choice([0, 200_000_000]))
     interval = Interval(begin_ns, end_ns, delay_ns, reach_ns, at_start)
     scales = rng.uniform(0.0, 0.1, 6) * rng.integers(2)
-    figures = MotionFigures(rng.uniform(1e-5, 1e-2, 6), scales, rng.uniform(0.5, 2.0, 2))
+    figures = MotionFigures(
+        rng.uniform(1e-5, 1e-2, 6), scales, rng.uniform(0.5, 2.0, 2), np.ones(6)
+    )
     p = 3 if x.is_planar else 6
     out = Advanced(
         np.zeros((4, 4)),

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_runs import held
 from scipy.special import chdtri
 from strategies import generators
 
@@ -17,6 +18,8 @@ from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.filter.arrays import FilterArrays
+from slam_observer_ros.filter.flat_arrays import Interval
+from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.models import calibration as calibrations
@@ -26,8 +29,7 @@ from slam_observer_ros.models.calibration import (
     MIN_DELAY_S,
     OF_VELOCITY,
 )
-from slam_observer_ros.models.integration import DelayEvidence
-from slam_observer_ros.models.motion import Motion
+from slam_observer_ros.models.velocity_delay import DelayEvidence
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.runs.health import of_calibration
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
@@ -396,32 +398,28 @@ def test_only_axes_of_the_motion_are_calibrated(axes, count):
     np.testing.assert_array_equal(calibration.apply(V)[0, axes.pose], 2.0)
 
 
-@given(generators(), st.sampled_from([SPATIAL, PLANAR]))
-def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
-    calibration, pieces, dt_s = Calibration(FilterArrays(np.eye(4)), EVERYTHING, axes), 5, 0.01
+@given(generators(), st.booleans())
+def test_sensitivity_is_the_derivative_of_the_motion(rng, two_d_mode):
+    gains = RiccatiGains(replace(EVERYTHING, two_d_mode=two_d_mode), np.eye(4))
+    pieces, dt_s = 5, 0.01
+    calibration, axes = gains.calibration, gains.axes
     V = np.zeros((pieces, 6))
     V[:, axes.pose] = rng.normal(size=(pieces, axes.p))
     start = se3.exp(axes.full_pose(rng.normal(size=axes.p)))
+    velocities, end_ns = held(V, np.full(pieces, dt_s)), round(1e9 * pieces * dt_s)
 
-    def path(change):
+    def moved(change):
         calibration.shift(change)
-        held_s = np.full(pieces, dt_s)
-        held_s[[0, -1]] += change[-1] * np.array([1.0, -1.0])  # a longer delay: earlier velocities
-        steps = se3.exp(calibration.apply(V) * held_s[:, None])
+        interval = Interval(0, end_ns, calibration.delay_ns, 1000, V[0])
+        found = gains.effect(start, velocities, interval)
         calibration.shift(-change)
-        poses = [start]
-        for step in steps:
-            poses.append(poses[-1] @ step)
-        return np.array(poses)
+        return found
 
-    nominal = path(np.zeros(calibration.count))
-    held_s, no_noise = np.full(pieces, dt_s), np.zeros((pieces, 6, 6))
-    motion = Motion(nominal, V, held_s, no_noise, pieces * dt_s, V[[0, -1]], calibration)
-    F = motion.sensitivity
-    h = 1e-6
+    nominal, h = moved(np.zeros(calibration.count)), 1e-6
     for column, unit in enumerate(np.eye(calibration.count)):
-        error = se3.log(path(h * unit)[-1] @ se3.inverse(nominal[-1]))[axes.pose] / h
-        np.testing.assert_allclose(F[:, column], error, atol=1e-3 * dt_s * pieces)
+        error = se3.log(moved(h * unit).A @ se3.inverse(nominal.A))[axes.pose] / h
+        found = nominal.sensitivity[:, column]
+        np.testing.assert_allclose(found, error, atol=1e-3 * dt_s * pieces)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -449,20 +447,13 @@ def test_drift_lets_the_uncertainty_grow_with_time():
         velocity_delay_stddev=0.0,
         calibration_drift=0.5,
     )
-    calibration = Calibration(FilterArrays(np.eye(4)), settings, SPATIAL)
-    P = calibration.initial_covariance()
-    still = Motion(
-        np.tile(np.eye(4), (5, 1, 1)),
-        np.zeros((4, 6)),
-        np.array([1.0, 1.0, 0.5, 1.0]),
-        np.zeros((4, 6, 6)),
-        4.0,  # half a second of it without a velocity
-        np.zeros((2, 6)),
-        calibration,
-    )
-    still.predict(P)
+    gains = RiccatiGains(settings, np.eye(4))
+    still = held(np.zeros((4, 6)), np.ones(4))
+    still = still._replace(timeout_ns=10**9 // 2)  # half of the time none is known
+    gains.advance(still, Interval(0, 4 * 10**9, 0, 0, None))
     # Four seconds at half the initial standard deviation per √s: σ² (1 + 4 · 0.25).
-    np.testing.assert_allclose(np.diag(P)[6:], np.array([0.1, 0.02]) ** 2 * 2.0)
+    found = np.diag(gains.joint.P)[6:]
+    np.testing.assert_allclose(found, np.array([0.1, 0.02]) ** 2 * 2.0)
 
 
 def test_a_bias_that_drifts_is_followed():
@@ -488,12 +479,11 @@ def test_relinearising_does_not_undo_that_a_scale_has_changed():
 
 def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
     """As a robot that is carried; though its velocity has a bias, which is no motion either."""
-    calibration = Calibration(FilterArrays(np.eye(4)), EVERYTHING, SPATIAL)
-    calibration.shift(np.full(calibration.count, 0.1))
-    path = np.array([np.eye(4), se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))])
-    zero = np.zeros(1)
-    carried = Motion(path, np.zeros((1, 6)), zero, np.zeros((1, 6, 6)), 0.0, None, calibration)
-    assert not carried.sensitivity.any()
+    gains = RiccatiGains(EVERYTHING, np.eye(4))
+    gains.calibration.shift(np.full(gains.calibration.count, 0.1))
+    there = se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))
+    assert not gains.slip(there, np.zeros((6, 6))).sensitivity.any()
+    np.testing.assert_array_equal(gains.observer.A, there)
 
 
 @pytest.mark.parametrize(

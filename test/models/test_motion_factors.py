@@ -7,14 +7,13 @@ import math
 from gain_worlds import configuration_error_m, drive, estimate
 import numpy as np
 import pytest
+from random_runs import held, propagate
 
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.filter.arrays import FilterArrays
-from slam_observer_ros.lie.axes import axes_of
-from slam_observer_ros.models.calibration import Calibration
+from slam_observer_ros.filter.flat_arrays import Interval
+from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.models.held_velocities import HeldVelocities
-from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.models.motion_noise import gated_score, MotionFactors, MotionNoise
 from slam_observer_ros.runs.health import of_noise
 from slam_observer_ros.runs.recorders import NisTally
@@ -126,23 +125,21 @@ def test_gaps_and_a_robot_that_stands_say_nothing():
     assert [part.name for part in factors.estimates] == ['turning', 'driving']
 
 
-@pytest.mark.parametrize(
-    ('velocity', 'dt_s', 'is_slip'), [(0.0, 0.1, False), (1.0, 0.0, False), (1.0, 0.1, True)]
-)
-def test_of_what_motion_nothing_can_be_learnt(velocity, dt_s, is_slip):
-    calibration = Calibration(FilterArrays(np.eye(4)), RIGHT, axes_of(True))
-    path, noise = np.array([np.eye(4)] * 2), np.eye(6)[None]
-    motion = Motion(path, np.full((1, 6), 1.0), np.array([0.1]), noise, 0.1, None, calibration)
-    of_turning, of_driving = motion.noise_by_kind
+@pytest.mark.parametrize('what', ['it stands', 'a gap', 'a slip'])
+def test_of_what_motion_nothing_can_be_learnt(what):
+    gains, noise = RiccatiGains(RIGHT, np.eye(4)), 0.01 * np.eye(6)[None]
+    motion = propagate(gains, np.ones((1, 6)), np.array([0.1]), noise)
+    of_turning, of_driving = gains.motion_noise.factors.flat().shares
     np.testing.assert_allclose(of_turning + of_driving, motion.noise)
-    np.testing.assert_array_equal(np.diagonal(of_turning), [1.0, 0.0, 0.0])
-    useless = replace(
-        motion,
-        measured_velocities=np.full((1, 6), velocity),
-        dt_s=np.array([dt_s]),
-        is_slip=is_slip,
-    )
-    assert useless.noise_by_kind is None
+    np.testing.assert_allclose(of_turning.diagonal(), [0.01, 0.0, 0.0], atol=1e-3)
+    if what == 'it stands':
+        propagate(gains, np.zeros((1, 6)), np.array([0.1]), noise)
+    elif what == 'a gap':
+        brief = held(np.ones((1, 6)), np.array([0.1]))._replace(timeout_ns=10**7)
+        gains.advance(brief, Interval(0, 10**8, 0, 0, None))
+    else:
+        gains.slip(np.eye(4), noise[0])
+    assert gains.motion_noise.factors.flat() is None
 
 
 def test_every_hypothesis_has_its_own_and_a_reset_forgets_them():

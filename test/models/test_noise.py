@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+import random_runs
 from strategies import generators
 
 from slam_observer_ros.estimator.estimator import Estimator
@@ -17,12 +18,10 @@ from slam_observer_ros.events import (
     ObservationEvent,
     VelocityEvent,
 )
-from slam_observer_ros.filter.arrays import FilterArrays
+from slam_observer_ros.filter.flat_arrays import Interval
+from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.lie.axes import SPATIAL
-from slam_observer_ros.models.calibration import Calibration
 from slam_observer_ros.models.held_velocities import HeldVelocities
-from slam_observer_ros.models.integration import transition, transition_covariance
 from slam_observer_ros.models.motion_noise import MotionNoise
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.models.velocity_history import VelocityHistory
@@ -175,28 +174,24 @@ def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(variance):
 @given(generators())
 def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
     settings = Settings(angular_velocity_noise=(0.01,) * 3, linear_velocity_noise=(0.02,) * 3)
-    pieces, dt_ns = 5, 10_000_000
+    pieces, dt_s, gains = 5, 0.01, RiccatiGains(settings, np.eye(4))
     V = rng.normal(size=(pieces, 6))
+    whole = Interval(0, round(1e9 * pieces * dt_s), 0, 0, None)
 
     def way(V):
-        history = VelocityHistory(10**9)
-        for piece, velocity in enumerate(V):
-            history.append(VelocityEvent(piece * dt_ns, velocity))
-        return history, Calibration(FilterArrays(np.eye(4)), Settings(), SPATIAL)
+        return gains.effect(np.eye(4), random_runs.held(V, np.full(pieces, dt_s)), whole)
 
     def error(piece, w):
         moved = V.copy()
-        moved[piece] += w / (dt_ns * 1e-9)
-        Phi = transition(*way(V), 0, pieces * dt_ns)
-        return se3.log(transition(*way(moved), 0, pieces * dt_ns) @ se3.inverse(Phi))
+        moved[piece] += w / dt_s
+        return se3.log(way(moved).A @ se3.inverse(way(V).A))
 
     expected = np.zeros((6, 6))
-    Q = np.diag([1e-4] * 3 + [4e-4] * 3) * dt_ns * 1e-9
+    Q = np.diag([1e-4] * 3 + [4e-4] * 3) * dt_s
     for piece in range(pieces):
         F = np.array([error(piece, 1e-6 * w) / 1e-6 for w in np.eye(6)]).T
         expected += F @ Q @ F.T
-    found = transition_covariance(*way(V), MotionNoise(settings), 0, pieces * dt_ns)
-    assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
+    assert np.linalg.norm(way(V).noise - expected) < 1e-3 * np.linalg.norm(expected)
 
 
 def test_the_error_of_a_message_goes_on_while_none_follows():

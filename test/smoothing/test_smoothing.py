@@ -18,6 +18,7 @@ from gain_worlds import (
 from hypothesis import given
 import numpy as np
 import pytest
+from random_runs import held
 from smoothing_problems import POSES, Problem, random_covariances
 from strategies import generators
 
@@ -25,12 +26,12 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.filter.arrays import FilterArrays
+from slam_observer_ros.filter.flat_arrays import Interval
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.models.calibration import Calibration
-from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.recordings.trajectory import Trajectory
 from slam_observer_ros.runs.metrics import trajectory_errors
@@ -144,20 +145,20 @@ def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
     )
     V, dt_s = np.zeros((k, 6)), np.full(k, 0.2)
     V[:, axes.pose] = rng.normal(size=(k, d))
-    path = [np.eye(4)]
-    for motion in se3.exp(V * dt_s[:, None]):
-        path.append(path[-1] @ motion)
-    path, covariances = np.array(path), random_covariances(rng, k, 6, 0.1)
+    gains = RiccatiGains(replace(settings, two_d_mode=axes is PLANAR), np.eye(4))
+    velocities = held(V, dt_s, random_covariances(rng, k, 6, 0.1))
 
     def keyframes(*cuts):
-        calibration = Calibration(FilterArrays(np.eye(4)), settings, axes)
+        calibration, pose = gains.calibration, np.eye(4)
         count = d + calibration.count
         start = Prior(np.eye(4), calibration.values, *NOTHING_KNOWN, np.eye(count))
         history = History(axes, ObservationNoise(settings), start, 'the start')
         for a, b in pairwise((0, *cuts, k)):
-            pieces = path[a : b + 1], V[a:b], dt_s[a:b], covariances[a:b]
-            history.move(Motion(*pieces, float(dt_s[a:b].sum()), np.zeros((2, 6)), calibration))
-        history.add(Keyframe(0, *NOTHING), path[-1], calibration.values)
+            interval = Interval(a * 2 * 10**8, b * 2 * 10**8, 0, 0, None)
+            motion = gains.effect(pose, velocities, interval)
+            history.move(pose, motion, np.zeros((calibration.count,) * 2), calibration)
+            pose = motion.A
+        history.add(Keyframe(0, *NOTHING), pose, calibration.values)
         return history.keyframes()
 
     whole, parts = keyframes(), keyframes(1, 3)
@@ -184,14 +185,9 @@ def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     path = np.concatenate([np.eye(4)[None], poses])
     for part in range(3):
         motion = SimpleNamespace(
-            path=path[part : part + 2],
-            noise=noises[part],
-            sensitivity=sensitivities[part],
-            drift=np.diag(np.full(c, 0.1)),
-            calibration=calibration,
-            is_slip=False,
+            A=path[part + 1], noise=noises[part], sensitivity=sensitivities[part]
         )
-        history.move(motion)
+        history.move(path[part], motion, 0.1 * np.eye(c), calibration)
     history.add(Keyframe(0, *NOTHING), path[-1], calibration.values)
     history.add(Keyframe(1, *NOTHING), path[-1], calibration.values)  # nothing has moved since
     keyframes = history.keyframes()

@@ -96,7 +96,7 @@ class ActiveLandmarks(JointCovariance):
         self._postponed.move(turn, x[self._entries])
         self._following.work()
 
-    def note_motion(self) -> None:
+    def note_motion(self, duration_s: float) -> None:
         """Let the next observation look at some references, by which motions are judged."""
         self._has_moved = True
 

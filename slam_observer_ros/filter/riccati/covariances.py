@@ -23,7 +23,6 @@ from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.filter.riccati.active_landmarks import ActiveLandmarks
 from slam_observer_ros.lie.matrices import transpose
-from slam_observer_ros.models.motion import Motion
 
 
 class ExactMapCovariance(JointCovariance):
@@ -44,10 +43,6 @@ class ExactMapCovariance(JointCovariance):
     def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray | None:
         """Return None: how far the map is off, nobody knows."""
         return None
-
-    def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
-        """Add a motion's noise to the covariance of the pose."""
-        motion.predict(self.P)
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
         """Return C_i of r_i = C_i (ε, c̃): [−[ŷ_i]×, I] of ε."""

@@ -29,7 +29,6 @@ from slam_observer_ros.filter.riccati.covariances import CompressedCovariance, E
 from slam_observer_ros.filter.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import block_diagonal, solve_symmetric
-from slam_observer_ros.models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
@@ -77,15 +76,6 @@ class RiccatiGains(OrientationGains):
         other = super().copy()
         other.errors = self.errors.copy(other.observer)
         return other
-
-    def advance(self, motion: Motion) -> None:
-        """Move pose and landmarks along a motion (27), and add its noise to P."""
-        super().advance(motion)
-        self.joint.note_motion()
-        observer, active = self.observer, self.joint.active
-        points = observer.y_ref[active] + observer.a[active]
-        self.joint.propagate(motion, points, observer.u[active])
-        self.motion_noise.factors.move(motion.noise_by_kind)
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks (m,) are in P."""
