@@ -11,7 +11,8 @@ from slam_observer_ros.filter.arrays import FilterArrays
 from slam_observer_ros.lie.axes import SPATIAL
 from slam_observer_ros.models import sensing
 from slam_observer_ros.models.calibration import Calibration, without_calibration
-from slam_observer_ros.models.observation_noise import ObservationNoise, repetition_factors
+from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.models.point_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 

@@ -424,7 +424,7 @@ class Estimator(Estimate):
         signs = [*counts, self._localiser.counts['lost']]
         if self._undisturbed.is_due(event.stamp_ns, signs):
             self._look(event.stamp_ns)
-        warnings.large_map(len(state.landmarks), limit, state.gains)
+        warnings.large_map(len(state.landmarks.ids), limit, state.gains)
 
     def _look(self, stamp_ns: int) -> None:
         """Look at what was learnt of the odometry, now and then."""

@@ -226,7 +226,7 @@ typedef struct {
 static const char *const FACTORS[] = {"d2pp", "D2", "D22", "D2", "f", NULL};
 
 typedef struct {
-    double *A, *points, *r, *weights, *origins, *lines_of_sight, *covariances, *dt_s, *moved;
+    double *A, *points, *r, *weights, *origins, *lines_of_sight, *covariances, *repeated, *moved;
     double *judged;
     int judges;
 } Observed;
@@ -814,7 +814,7 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
         double *y = out->points + 3 * j, *r = out->r + 3 * j, *origin = out->origins + 3 * j;
         double *stated = res->stated + 9 * j, from_robot[3], expected[3], arm[3], line[3], C[9];
         calibrated_point(seen, j, turned, x->is_planar, y, origin, stated);
-        out->weights[j] = 0.0, out->dt_s[j] = INFINITY;
+        out->weights[j] = 0.0, out->repeated[j] = 1.0;
         memset(r, 0, 3 * sizeof(double));
         if (row < 0)
             continue;
@@ -854,8 +854,8 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
         else if (seen->D != NULL)
             memcpy(res->D + k * x->c * i, seen->D + 3 * x->c * j,
                    (size_t)(k * x->c) * sizeof(double));
-        out->dt_s[j] = unseen_s(table, row, seen->stamp_ns);
-        res->repeated[i] = repetition_factor(out->dt_s[j], limits->error_time_s);
+        double dt_s = unseen_s(table, row, seen->stamp_ns);
+        out->repeated[j] = res->repeated[i] = repetition_factor(dt_s, limits->error_time_s);
         res->rows[i] = row, res->at[i++] = j;
     }
     return 1;

@@ -18,7 +18,6 @@ step.py and _core.c spell the step out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,15 +34,6 @@ class SlamElement:
 
     A: FloatArray  # (…, 4, 4)
     a: FloatArray  # (…, n, 3)
-
-
-class ChartStep(NamedTuple):
-    """How exp(x) moves a state of n landmarks."""
-
-    X: SlamElement  # Â ← A Â, ŷ_i ← A ŷ_i + a_i
-    calibration: FloatArray  # (c,) change of the calibration
-    turns: FloatArray | None  # (n, 3) rotation vectors of orientations, if these are estimated
-    velocities: FloatArray | None  # (n, 3) changes of velocities, m/s, likewise
 
 
 class Chart:
@@ -177,17 +167,11 @@ class Chart:
         """Return P of what :meth:`of_positions` returns."""
         return sheared(P, self.first, self.all_still(points))
 
-    def step(self, x: FloatArray) -> ChartStep:
-        """Return exp(x): ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
+    def exp(self, x: FloatArray) -> SlamElement:
+        """Return exp(x) without what no point has: ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
         axes, k, p = self.axes, self.axes.point, self.axes.p
-        parts = x[self.first :].reshape(-1, self.stride)
-        xi, omega, u = np.split(parts, [k, k + self.turn], axis=1)
-        return ChartStep(
-            slam_exp(axes.full_pose(x[:p]), axes.full_points(xi)),
-            x[p : self.robot],
-            axes.full_turns(omega) if self.turn else None,
-            axes.full_points(u) if self.velocity else None,
-        )
+        xi = x[self.first :].reshape(-1, self.stride)[:, :k]
+        return slam_exp(axes.full_pose(x[:p]), axes.full_points(xi))
 
 
 def sheared(P: FloatArray, first: int, L: FloatArray) -> FloatArray:

@@ -18,11 +18,14 @@ from functools import partial
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.filter.gains import Gains, PlainGains
-from slam_observer_ros.filter.observer import lyapunov, Residuals
+from slam_observer_ros.filter.flat_arrays import Limits, Observed, Seen
+from slam_observer_ros.filter.gains import Gains, room_for
+from slam_observer_ros.filter.observer import lyapunov
+from slam_observer_ros.filter.step import located
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import EstimatedAxes, SPATIAL
 from slam_observer_ros.models.calibration import SENSOR_STDDEVS, VELOCITY_STDDEVS
+from slam_observer_ros.models.point_noise import PointFigures
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
@@ -48,27 +51,40 @@ class ConstantGains(Gains):
         'orientation_noise',
     )
 
-    @property
-    def plain(self) -> PlainGains:
-        """Itself."""
-        return self
+    def observe(
+        self, seen: Seen, figures: PointFigures, limits: Limits, is_judged: bool
+    ) -> Observed:
+        """Move the state by the innovation (28)–(31) of all that is seen: nothing is rejected."""
+        known, out = seen.rows >= 0, room_for(seen, 0, is_judged)
+        out.points[:], out.origins[:], _ = located(seen, self._settings.two_d_mode)
+        rows, landmarks = seen.rows[known], self.observer.landmarks
+        out.r[:], out.weights[:] = 0.0, known
+        if len(rows):
+            dt_s = landmarks.unseen_s(rows, seen.stamp_ns)
+            out.r[known] = self.correct(rows, out.points[known], dt_s)
+            landmarks.accept(rows, seen.stamp_ns)
+        return out
 
-    def observe(self, residuals: Residuals) -> FloatArray:
-        """Integrate the innovation (30), (31) over the time since landmarks were seen before."""
+    def correct(self, rows: IntArray, points: FloatArray, dt_s: FloatArray) -> FloatArray:
+        """Integrate the innovation (30), (31) over the times since landmarks were seen before.
+
+        Of landmarks ``rows`` (m,) seen at ``points`` (m, 3), body frame, ``dt_s`` (m,) before.
+        Return their residuals (m, 3) until then.
+        """
         # The gains, and how long they act.
-        settings, e, r = self._settings, residuals.e, residuals.r
+        settings, (e, r) = self._settings, self.observer.errors(rows, points)
         gain_l = 0.0 if self.observer.is_exact else settings.gain_l
         k = np.full(len(r), settings.gain_k)
         step = paper_step if settings.step_mode == 'paper' else centroid_step
-        dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)
+        dt_s = np.minimum(dt_s, settings.max_innovation_time)
         # One time for the pose: were the r_i to act for different ones, L (34) might grow.
         D = safe_step(partial(step, axes=self.axes), k, e, r, float(np.mean(dt_s)))  # (30)
         # What the pose's step leaves of each residual is closed in part by its landmark.
         remaining = se3.transform(D, e) - e + r
         shares = -np.expm1(-gain_l / settings.gain_k * dt_s)
         d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
-        self.observer.correct(D, residuals.rows, d)
-        return np.ones(len(k))
+        self.observer.correct(D, rows, d)
+        return r
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Put the known landmarks where they are known to be."""

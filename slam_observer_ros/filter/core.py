@@ -18,7 +18,7 @@ from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.filter.robust import AT_ONCE
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.motion_noise import Factors, MotionFigures
-from slam_observer_ros.models.observation_noise import PointFigures
+from slam_observer_ros.models.point_noise import PointFigures
 
 COMPILED = compiled('filter._core')
 

@@ -88,7 +88,7 @@ class Observed(NamedTuple):
     lines_of_sight: FloatArray  # (m, 3) from the sensor to where each should be now
     # (m, 3, 3) of the points, body frame, m²; (0, 3, 3) where none were stated
     covariances: FloatArray
-    dt_s: FloatArray  # (m,) since each was seen before; infinite if it was not
+    repeated: FloatArray  # (m,) by what factor their covariances grow, as errors last
     moved: FloatArray  # (N,) −K r
     # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
     # normalised innovation squared of those used, zero at first; empty where nobody asks

@@ -20,7 +20,14 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.filter import core, step
 from slam_observer_ros.filter.arrays import SeenOrientations
-from slam_observer_ros.filter.flat_arrays import Advanced, FilterState, Interval
+from slam_observer_ros.filter.flat_arrays import (
+    Advanced,
+    FilterState,
+    Interval,
+    Limits,
+    Observed,
+    Seen,
+)
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Observer, Residuals
@@ -32,6 +39,7 @@ from slam_observer_ros.models.calibration import (
 )
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.motion_noise import MotionNoise
+from slam_observer_ros.models.point_noise import PointFigures
 from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
@@ -42,17 +50,14 @@ OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 
 
 class Errors:
-    """Errors of an ``observer``'s X̂, as the covariance P, ``joint``, has them.
+    """The errors of X̂, as the covariance P, ``joint``, of gains that know it has them.
 
     They are in the reference frame; covariances are in m² and rad².
     """
 
-    def __init__(self, observer: Observer, joint: JointCovariance, axes: EstimatedAxes) -> None:
-        self.observer, self.joint, self.axes = observer, joint, axes
-
-    def copy(self, observer: Observer) -> Errors:
-        """Return an independent copy for a copy of the observer."""
-        return Errors(observer, self.joint.copy(observer), self.axes)
+    observer: Observer
+    joint: JointCovariance
+    axes: EstimatedAxes
 
     def pose_covariance(self) -> FloatArray:
         """Return the covariance (6, 6) of ε in Â = exp(ε) A; zero on axes not estimated."""
@@ -109,18 +114,11 @@ class TagGains(Protocol):
         """Take over orientations as they are seen, where none is known yet."""
 
 
-class PlainGains(Protocol):
-    """What moves X̂ without knowing a covariance of its errors."""
-
-    def observe(self, residuals: Residuals) -> FloatArray:
-        """Move the state by the innovation (28)–(31); return the weights (m,) of the residuals."""
-
-
 class Gains(ABC):
     """What moves an ``observer``'s X̂, which starts at ``reference_pose`` P° (4, 4)."""
 
     ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect
-    errors: Errors | None = None  # of pose and landmarks together, if their covariance is known
+    joint: JointCovariance | None = None  # P, if it is known
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
@@ -148,21 +146,21 @@ class Gains(ABC):
         return None
 
     @property
-    def plain(self) -> PlainGains | None:
-        """What moves it where no covariance is known; else :func:`.step.observe` does."""
+    def errors(self) -> Errors | None:
+        """Itself, if it knows the covariance of pose and landmarks together."""
         return None
 
     # The step (27)-(31)
 
     def flat(self) -> FilterState:
         """Return the estimate as plain arrays: of the landmarks in P, or all of an exact map."""
-        observer, calibration, errors = self.observer, self.calibration, self.errors
+        observer, calibration, joint = self.observer, self.calibration, self.joint
         rows: IntArray | slice = slice(None)
-        if errors is None:  # as of an exact map
+        if joint is None:  # as of an exact map
             P, size = np.zeros((self._robot, self._robot)), self._robot
             first, stride, u = size, 0, None
         else:
-            joint, P, size = errors.joint, observer.covariance._storage, observer.covariance._size
+            P, size = observer.covariance._storage, observer.covariance._size
             first, stride = joint.first, 0 if observer.is_exact else joint.chart.stride
             rows = rows if observer.is_exact else joint.active
             u = observer.u if joint.chart.velocity else None
@@ -189,21 +187,22 @@ class Gains(ABC):
     def advance(self, velocities: Velocities, interval: Interval) -> Advanced:
         """Move pose and landmarks along velocities (27); return what that did."""
         duration_s = to_s(interval.end_ns - interval.start_ns)
-        self.observer.move_landmarks(duration_s)
-        if self.errors is not None:
-            self.errors.joint.note_motion(duration_s)
+        if self.observer.have_moved:  # else this would cost O(n) at every step
+            self.observer.a += self.observer.u * duration_s  # (27) has zero, here they move (19)
+        if self.joint is not None:
+            self.joint.note_motion(duration_s)
         x, out = self.flat(), self._room_for_motion()
         status = core.advance(x, velocities, interval, self.motion_noise.figures, out)
         x.A[...] = out.A
-        if self.errors is not None:
+        if self.joint is not None:
             shares = np.array([out.of_turning, out.noise - out.of_turning])
             self.motion_noise.factors.move(None if status == step.AT_REST else shares)
         return out
 
     def slip(self, A: FloatArray, covariance: FloatArray) -> Advanced:
         """Let the robot be at Â = ``A`` (4, 4): :func:`.step.slip`."""
-        if self.errors is not None:
-            self.errors.joint.note_motion(0.0)
+        if self.joint is not None:
+            self.joint.note_motion(0.0)
         x, out = self.flat(), self._room_for_motion()
         step.slip(x, A, covariance, out)
         x.A[...] = out.A
@@ -218,8 +217,8 @@ class Gains(ABC):
         Each is along other velocities. Zero on axes that are not estimated, and without errors.
         """
         known, p = np.zeros((self._robot, self._robot)), self.axes.p
-        if self.errors is not None:
-            known = self.errors.joint.of_robot
+        if self.joint is not None:
+            known = self.joint.of_robot
         x, out = self._alone(self.observer.A), self._room_for_motion()
         A, covariances = [], []
         for each, interval in zip(velocities, intervals, strict=True):
@@ -252,6 +251,16 @@ class Gains(ABC):
             at_end=np.empty(6),
             variances=np.empty(6),
         )
+
+    @abstractmethod
+    def observe(
+        self, seen: Seen, figures: PointFigures, limits: Limits, is_judged: bool
+    ) -> Observed | None:
+        """Move the state by the innovation (28)–(31) of landmarks ``rows`` that are seen.
+
+        Return what that did, and how far off they were if ``is_judged``. None, with nothing
+        changed, where most are rejected and that may be refused.
+        """
 
     def activate(self, rows: IntArray) -> None:  # noqa: B027 (most gains treat all alike)
         """See to it that landmarks (m,) are at hand that are going to be observed."""
@@ -370,3 +379,20 @@ class Gains(ABC):
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
         return np.zeros(len(residuals.r))
+
+
+def room_for(seen: Seen, size: int, is_judged: bool) -> Observed:
+    """Return room for the effect of an observation on a state of N = ``size`` errors."""
+    m = len(seen.rows)
+    return Observed(
+        A=np.empty((4, 4)),
+        points=np.empty((m, 3)),
+        r=np.empty((m, 3)),
+        weights=np.empty(m),
+        origins=np.empty((m, 3)),
+        lines_of_sight=np.empty((m, 3)),
+        covariances=np.empty((0 if seen.covariances is None else m, 3, 3)),
+        repeated=np.empty(m),
+        moved=np.empty(size),
+        judged=np.zeros(3 * m + 1 if is_judged else 0),
+    )

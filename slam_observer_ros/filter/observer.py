@@ -73,11 +73,6 @@ class Observer(FilterArrays):
         A[...] = path[-1]
         A[:3, :3] = so3.normalise(A[:3, :3])
 
-    def move_landmarks(self, duration_s: float) -> None:
-        """Add R_Â v_i dt to â_i, where (27) has zero: here landmarks may have velocities (19)."""
-        if self.have_moved:  # else this would cost O(n) at every step
-            self.a += self.u * duration_s
-
     def correct(self, D: FloatArray, rows: IntArray | slice, d: FloatArray) -> None:
         """Move the state from the left: X̂ ← (D, d_i) · X̂, d_i (m, 3) for landmarks ``rows``.
 

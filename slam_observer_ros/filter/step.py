@@ -47,7 +47,7 @@ from slam_observer_ros.models.motion_noise import (
     MotionFigures,
     stated_motion_covariances,
 )
-from slam_observer_ros.models.observation_noise import (
+from slam_observer_ros.models.point_noise import (
     point_covariances,
     PointFigures,
     repetition_factors,
@@ -328,7 +328,7 @@ def _residuals(
     """Return the residuals (29) of known landmarks, and what is stated of all points seen."""
     axes, R_hat, x_hat = axes_of(x.is_planar), x.A[:3, :3], x.A[:3, 3]
     k, at = axes.point, np.flatnonzero(seen.rows >= 0)
-    out.points[:], out.origins[:], stated = _calibrated(seen, x.is_planar)
+    out.points[:], out.origins[:], stated = located(seen, x.is_planar)
     rows, y, origins = seen.rows[at], out.points[at], out.origins[at]
     points = x.y_ref.take(rows, axis=0) + x.a.take(rows, axis=0)
     # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
@@ -350,9 +350,10 @@ def _residuals(
         D = np.zeros((len(r), k, len(x.drift)))
         of_sensor = sensor_sensitivity(seen.sensor, expected - origins)[:, :, seen.of_sensor]
         D[:, :, seen.column : seen.column + len(seen.of_sensor)] = (R_hat @ of_sensor)[:, :k]
-    out.r[:], out.dt_s[:] = 0.0, np.inf
+    out.r[:], out.repeated[:] = 0.0, 1.0
     out.r[at] = r
-    out.dt_s[at] = dt_s = landmarks.unseen_s(rows, seen.stamp_ns)
+    dt_s = landmarks.unseen_s(rows, seen.stamp_ns)
+    out.repeated[at] = repeated = repetition_factors(dt_s, limits.error_time_s)
     columns = x.first + np.arange(k) + x.stride * rows[:, None]
     residuals = _Residuals(
         at,
@@ -361,7 +362,7 @@ def _residuals(
         r,
         (R_hat @ covariances @ R_hat.T)[:, :k, :k],
         D,
-        repetition_factors(dt_s, limits.error_time_s),
+        repeated,
         axes,
     )
     return residuals, stated
@@ -375,7 +376,7 @@ def _are_sure(
     return is_confirmed & ~landmarks.in_doubt(rows, limits.max_rejections, further)
 
 
-def _calibrated(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+def located(seen: Seen, is_planar: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Return points y (m, 3) by the calibration of their sensor, and where that was (m, 3).
 
     And their covariances (m, 3, 3) where these are stated.

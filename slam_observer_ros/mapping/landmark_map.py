@@ -21,7 +21,7 @@ from slam_observer_ros.lie.matrices import (
     limited,
     MAX_DEVIATION,
 )
-from slam_observer_ros.models.observation_noise import RESOLUTION_M
+from slam_observer_ros.models.point_noise import RESOLUTION_M
 
 SAME_M = 0.2
 """How far landmarks may be from each other that look the same from a place that looks the same."""

@@ -256,7 +256,7 @@ class Calibration:
 
     def shifted(self, change: FloatArray) -> FloatArray:
         """Return the estimates (c,) after that; the delay stays within what can be made up for."""
-        values: FloatArray = self.values + change
+        values: FloatArray = self._owner.calibration[self._places] + change
         if self.delay_error_ns:
             least_s = min(MIN_DELAY_S, self._nominal[DELAY])
             delay = self.of_velocity - 1

@@ -30,7 +30,7 @@ from slam_observer_ros.filter.robust import straight_odds, straight_share
 from slam_observer_ros.lie.matrices import diagonal_blocks
 from slam_observer_ros.lie.sensor_mounting import completed_lines, directions_of, MEASURED
 from slam_observer_ros.models.calibration import SCALE
-from slam_observer_ros.models.observation_noise import point_covariances
+from slam_observer_ros.models.point_noise import point_covariances
 from slam_observer_ros.tracking.matching import calibrated, residuals_of
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.waiting_room import (

@@ -14,7 +14,7 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.lie import se3
 from slam_observer_ros.models import sensing
-from slam_observer_ros.models.observation_noise import RESOLUTION_M
+from slam_observer_ros.models.point_noise import RESOLUTION_M
 from slam_observer_ros.tracking.state import State
 
 SAME_POSITION = 4.0

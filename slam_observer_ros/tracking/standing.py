@@ -28,7 +28,7 @@ from slam_observer_ros.lie.matrices import (
     transpose,
     with_blocks,
 )
-from slam_observer_ros.models.observation_noise import repetition_factors
+from slam_observer_ros.models.point_noise import repetition_factors
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.tracking import covariances
 from slam_observer_ros.tracking.matching import calibrated

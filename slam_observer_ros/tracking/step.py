@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import Change, Reason, Update
+from slam_observer_ros.estimates import Change, NormalisedInnovation, Reason, Update
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.filter.arrays import SeenOrientations
+from slam_observer_ros.filter.flat_arrays import Limits, Observed, Seen
 from slam_observer_ros.filter.robust import accepted
+from slam_observer_ros.lie.sensor_mounting import Sensed
+from slam_observer_ros.models import sensing
 from slam_observer_ros.models.motion_noise import beyond_driving
-from slam_observer_ros.tracking.filtering import (
-    correct,
-    Corrected,
-    innovation_of,
-    keyframe,
-    NO_IDS,
-)
+from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.tracking.matching import (
     calibrated,
     calibrated_again,
@@ -33,6 +31,8 @@ from slam_observer_ros.tracking.tags import (
     seen_orientations,
     take_over_orientations,
 )
+
+NO_IDS = np.empty(0, dtype=np.int64)
 
 
 @overload
@@ -176,8 +176,130 @@ def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> No
 def _rows_to_forget(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
     """Return landmarks out of view, the least often seen, to be forgotten for the new ones."""
     limit, new = state.settings.max_landmarks, int(np.count_nonzero(rows < 0))
+    if limit == 0 or new == 0 or not state.is_mapping:
+        return NO_IDS
     excess = len(state.landmarks) + new - limit
-    if limit == 0 or new == 0 or excess <= 0 or not state.is_mapping:
+    if excess <= 0:
         return NO_IDS
     unseen = state.landmarks.unseen_since(event.stamp_ns)
     return np.sort(unseen[~np.isin(unseen, rows)][:excess])
+
+
+class Corrected(NamedTuple):
+    """An observation as the filter was given it, and its effect."""
+
+    rows: IntArray  # (m,) which landmarks its points are of, −1 for new ones
+    seen: Seen
+    out: Observed
+
+
+def correct(
+    state: State, event: ObservationEvent, rows: IntArray, may_refuse: bool = False
+) -> Corrected | None:
+    """Correct a state by the points (m,) of known landmarks ``rows``, −1 where one is new.
+
+    Return None, with nothing changed, where most are rejected and that ``may_refuse``.
+    """
+    settings, noise = state.settings, state.observation_noise
+    limits = Limits(
+        gate=settings.rejection_threshold,
+        huber=settings.huber_threshold,
+        error_time_s=noise.error_time_s,
+        confirmations=settings.confirmations,
+        max_rejections=settings.max_rejections,
+        may_refuse=may_refuse,
+    )
+    seen, before = _seen(state, event, rows), state.observer.A.copy()
+    out = state.gains.observe(seen, noise.figures, limits, state.judges_innovations)
+    if out is None:
+        return None
+    state.relinearisation.note_correction(before, state.observer.A)
+    return Corrected(rows, seen, out)
+
+
+def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
+    """Return points of landmarks ``rows``, −1 for new ones, and what calibrates their sensor.
+
+    Of points that were carried forward, the calibration's effect is given.
+    """
+    arms, covariances = _plain(event.lines_of_sight), event.covariances
+    origins = event.sensor
+    calibration = state.calibration
+    values, estimated, column, D = None, NO_IDS, 0, None
+    if event.sensed is not None:
+        expected, known = event.points.copy(), rows >= 0
+        expected[known] = state.observer.body_points(rows[known])
+        D = sensitivity(state, event, expected)
+    elif calibration.corrects_points:
+        frame = event.sensor_frame
+        values, estimated = calibration.sensor(frame), calibration.of_sensor
+        column = calibration.columns(frame).start
+    if state.settings.range_is_depth and event.sensed is None:
+        cosines = sensing.cosines(arms, event.sensor_axis)
+        arms = arms / cosines[:, None]
+        if covariances is not None:
+            covariances = covariances / cosines[:, None, None] ** 2
+    return Seen(
+        event.stamp_ns,
+        rows,
+        arms,
+        None if origins is None else _plain(origins),
+        None if covariances is None else _plain(covariances),
+        values,
+        estimated,
+        column,
+        None if D is None else _plain(D),
+    )
+
+
+def _plain(array: FloatArray) -> FloatArray:
+    """Return an array that may be of another precision or order as C has it."""
+    return np.ascontiguousarray(array, np.float64)
+
+
+def keyframe(
+    state: State,
+    event: ObservationEvent,
+    corrected: Corrected,
+    rows: IntArray,
+    turns: SeenOrientations | None,
+) -> Keyframe:
+    """Return the points as they are kept to be linearised again, of landmarks ``rows`` by now.
+
+    Without those whose landmark is not in the map, −1. ``turns`` are of the others.
+    """
+    seen, out, sensed = corrected.seen, corrected.out, event.sensed
+    if seen.sensor is not None:
+        number = state.calibration.sensors.index(event.sensor_frame)
+        origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
+        sensed = Sensed(np.full(len(rows), number), origins, seen.arms, event.orientations)
+    every = Keyframe(
+        event.stamp_ns,
+        rows,
+        out.points,
+        out.lines_of_sight,
+        out.covariances if len(out.covariances) else None,
+        out.repeated,
+        turns,
+        sensed,
+        event.kinds,
+        None if event.sensor is None and seen.sensor is None else out.origins,
+    )
+    kept = rows >= 0
+    return every if np.count_nonzero(kept) == len(rows) else every.select(kept)
+
+
+def innovation_of(state: State, corrected: Corrected) -> NormalisedInnovation | None:
+    """Return how far off the residuals of known landmarks were, if that was asked for."""
+    out, known = corrected.out, corrected.rows >= 0
+    if not len(out.judged):
+        return None
+    weights = out.weights[known]
+    if state.errors is None:
+        nothing, unlikely = np.zeros(len(weights)), np.full(len(weights), -np.inf)
+        return NormalisedInnovation(nothing, weights, None, 0, unlikely, np.ones(len(weights)))
+    distances, densities, shares = out.judged[:-1].reshape(3, -1)[:, known]
+    used = int(np.count_nonzero(weights))
+    nis = float(out.judged[-1]) if used else None
+    count = used * state.axes.point
+    return NormalisedInnovation(distances, weights, nis, count, densities, shares)

@@ -14,7 +14,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.filter.landmark_table import LandmarkTable
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.models.observation_noise import repetition_factors
+from slam_observer_ros.models.point_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 ERROR_TIME_S = 0.5

@@ -48,9 +48,7 @@ def biased_filter(reference_pose=None, bias_m=0.5):
 
 def observe(filter_, rows, points, dt_s):
     """Correct a filter by landmarks that were seen ``dt_s`` before."""
-    m = len(rows)
-    dt_s = np.broadcast_to(dt_s, m)
-    filter_.observe(filter_.residuals(rows, points, np.zeros((m, 3, 3)), dt_s, np.ones(m)))
+    filter_.correct(rows, points, np.broadcast_to(dt_s, len(rows)))
 
 
 def integrate_paper_ode(sign_of_landmarks, sign_of_pose, duration_s, dt_s=1e-3):

@@ -32,8 +32,8 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
-from slam_observer_ros.tracking.filtering import correct
 from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.step import correct
 
 CALIBRATED = replace(PLAIN, angular_bias_stddev=(0.02,) * 3, linear_scale_stddev=(0.1,) * 3)
 

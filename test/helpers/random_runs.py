@@ -6,15 +6,14 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.filter.constant import ConstantGains
 from slam_observer_ros.filter.flat_arrays import Advanced, Interval
 from slam_observer_ros.filter.gains import Gains
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking.filtering import correct
 from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.step import correct
 
 PLAIN = Settings(
     huber_threshold=0.0,
@@ -76,8 +75,6 @@ def observe(
     filter_: Gains, rows: IntArray, points: FloatArray, covariances: FloatArray
 ) -> FloatArray:
     """Correct a filter by landmarks (m,) seen at ``points`` (m, 3); return their weights."""
-    if isinstance(filter_, ConstantGains):
-        return filter_.observe(residuals_of(filter_, rows, points, covariances))
     seen = ObservationEvent(0, rows, points, covariances)
     corrected = correct(State(filter_, filter_._settings), seen, rows)
     return corrected.out.weights

@@ -17,7 +17,7 @@ from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.lie import se3
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.motion_noise import Factors, MotionFigures
-from slam_observer_ros.models.observation_noise import PointFigures
+from slam_observer_ros.models.point_noise import PointFigures
 from slam_observer_ros.models.velocity_history import NEVER_NS
 
 SECOND_NS = 1_000_000_000

@@ -9,10 +9,7 @@ import pytest
 
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.lie import so3
-from slam_observer_ros.models.observation_noise import (
-    ObservationNoise,
-    orientation_covariances,
-)
+from slam_observer_ros.models.observation_noise import ObservationNoise, orientation_covariances
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SETTINGS = Settings(

@@ -24,40 +24,24 @@ from slam_observer_ros.lie.matrices import mahalanobis, transpose, with_blocks
 from slam_observer_ros.models.observation_noise import RESOLUTION_RAD
 
 
-class OrientationGains(Gains):
+class OrientationGains(Errors, Gains):
     """What gains with a joint covariance do with orientations, where these are estimated."""
 
-    errors: Errors
+    joint: JointCovariance  # in the form that suits the map
 
     @property
-    def joint(self) -> JointCovariance:
-        """P, in the form that suits the map."""
-        return self.errors.joint
-
-    @joint.setter
-    def joint(self, joint: JointCovariance) -> None:
-        self.errors.joint = joint
+    def errors(self) -> Errors:
+        """Itself."""
+        return self
 
     @property
     def takes_all(self) -> bool:
         """Whether all landmarks are in P."""
         return self.joint.is_dense
 
-    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
-        """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
-        return self.errors.joint_covariance(rows)
-
     def landmark_covariance(self, rows: IntArray, tags: IntArray) -> FloatArray | None:
         """Return that (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,); or None."""
         return self.joint.of_landmarks(rows, self.observer.points[rows], tags)
-
-    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
-        """Return the joint covariance (m k, m k) of residuals, noise included."""
-        return self.errors.innovation_covariance(residuals)
-
-    def distances(self, residuals: Residuals) -> FloatArray:
-        """Return the Mahalanobis distance (m,) of each residual."""
-        return self.errors.distances(residuals)
 
     @property
     def tags(self) -> TagGains | None:
@@ -71,7 +55,7 @@ class OrientationGains(Gains):
     def learn_motion_noise(self, residuals: Residuals) -> None:
         """Let residuals show how noisy the motion was, before something else corrects it."""
         if len(residuals.rows):
-            S = self.errors.innovation_covariance(residuals)
+            S = self.innovation_covariance(residuals)
             self._learn_motion_noise(residuals, residuals.on(self.axes)[0], S)
 
     def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:

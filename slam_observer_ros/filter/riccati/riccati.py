@@ -19,16 +19,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.filter import core, step
 from slam_observer_ros.filter.arrays import UNKNOWN_RAD
 from slam_observer_ros.filter.chart import Chart
-from slam_observer_ros.filter.gains import Errors, OF_CONSTANT_GAINS
+from slam_observer_ros.filter.flat_arrays import Limits, Observed, Seen
+from slam_observer_ros.filter.gains import OF_CONSTANT_GAINS, room_for
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.known_landmarks import anchor, KnownLandmarks
+from slam_observer_ros.filter.landmark_table import Landmarks
 from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
 from slam_observer_ros.filter.riccati.covariances import CompressedCovariance, ExactMapCovariance
 from slam_observer_ros.filter.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import block_diagonal, solve_symmetric
+from slam_observer_ros.models.point_noise import PointFigures
 from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
@@ -64,7 +68,7 @@ class RiccatiGains(OrientationGains):
             self.calibration.initial_covariance(),
             np.array(unknown) ** 2,
         )
-        self.errors = Errors(self.observer, joint, self.axes)
+        self.joint = joint
 
     @staticmethod
     def estimated(settings: Settings) -> Settings:
@@ -74,8 +78,37 @@ class RiccatiGains(OrientationGains):
     def copy(self) -> Self:
         """Return an independent copy."""
         other = super().copy()
-        other.errors = self.errors.copy(other.observer)
+        other.joint = self.joint.copy(other.observer)
         return other
+
+    def observe(
+        self, seen: Seen, figures: PointFigures, limits: Limits, is_judged: bool
+    ) -> Observed | None:
+        """Move the state, and P with it, by the innovation (28)–(31): :func:`.step.observe`."""
+        observer, joint, factors = self.observer, self.joint, self.motion_noise.factors
+        known = seen.rows >= 0
+        rows, places = seen.rows[known], np.full(len(known), -1)
+        joint.activate(rows)
+        places[known] = joint.places(rows)
+        x, learnt = self.flat(), factors.flat() if len(rows) else None
+        columns, in_arrays = observer.landmarks.columns, joint.active
+        if observer.is_exact:
+            in_arrays = slice(None)
+        landmarks = Landmarks(*[column[in_arrays] for column in columns])
+        out, seen = room_for(seen, x.size, is_judged), seen._replace(rows=places)
+        if core.observe(x, landmarks, seen, figures, limits, learnt, out) == step.REJECTS:
+            return None
+        if len(rows):
+            factors.take(learnt)
+        if isinstance(in_arrays, np.ndarray):  # else they are views, changed in place
+            observer.a[in_arrays] = x.a
+            for column, changed in zip(columns, landmarks, strict=True):
+                column[in_arrays] = changed
+        D = out.A @ se3.inverse(x.A)
+        x.A[...] = out.A
+        joint.follow(out.moved)
+        self._move_others(out.moved, D)
+        return out
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks (m,) are in P."""
@@ -212,7 +245,7 @@ class RiccatiGains(OrientationGains):
 
     def _moved_points(self, rows: IntArray, x: FloatArray) -> FloatArray:
         """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
-        X = self.joint.chart.step(x).X
+        X = self.joint.chart.exp(x)
         return np.asarray(se3.rotate(X.A, self.observer.points[rows]) + X.a[rows])
 
     @property
@@ -230,12 +263,19 @@ class RiccatiGains(OrientationGains):
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
-        step, observer = self.joint.chart.step(x), self.observer
-        self.calibration.shift(step.calibration)
-        X, moved = step.X, self.joint.active  # none in an exact map
+        X, observer, moved = self.joint.chart.exp(x), self.observer, self.joint.active
         turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
         observer.correct(X.A, moved, X.a + turned)
-        if step.velocities is not None:
-            observer.correct_velocities(X.A, moved, step.velocities)
-        if step.turns is not None:
-            observer.orientations.turn(moved, so3.exp(step.turns))
+        self._move_others(x, X.A)
+
+    def _move_others(self, x: FloatArray, D: FloatArray) -> None:
+        """Let calibration, orientations and velocities follow exp(x), which moves Â by D."""
+        chart, axes, moved = self.joint.chart, self.axes, self.joint.active
+        self.calibration.shift(x[axes.p : chart.robot])
+        of_landmarks = x[chart.first :].reshape(-1, chart.stride)
+        if chart.turn:
+            turns = axes.full_turns(of_landmarks[:, axes.point : axes.point + chart.turn])
+            self.observer.orientations.turn(moved, so3.exp(turns))
+        if chart.velocity:
+            change = axes.full_points(of_landmarks[:, -chart.velocity :])
+            self.observer.correct_velocities(D, moved, change)
