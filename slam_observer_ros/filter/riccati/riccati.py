@@ -104,10 +104,10 @@ class RiccatiGains(OrientationGains):
             observer.a[in_arrays] = x.a
             for column, changed in zip(columns, landmarks, strict=True):
                 column[in_arrays] = changed
-        D = out.A @ se3.inverse(x.A)
+        before = x.A.copy()
         x.A[...] = out.A
         joint.follow(out.moved)
-        self._move_others(out.moved, D)
+        self._move_others(out.moved, before)
         return out
 
     def activate(self, rows: IntArray) -> None:
@@ -264,18 +264,22 @@ class RiccatiGains(OrientationGains):
 
     def _move(self, x: FloatArray) -> None:
         X, observer, moved = self.joint.chart.exp(x), self.observer, self.joint.active
+        before = observer.A.copy()
         turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
         observer.correct(X.A, moved, X.a + turned)
-        self._move_others(x, X.A)
+        self._move_others(x, before)
 
-    def _move_others(self, x: FloatArray, D: FloatArray) -> None:
-        """Let calibration, orientations and velocities follow exp(x), which moves Â by D."""
+    def _move_others(self, x: FloatArray, before: FloatArray) -> None:
+        """Let calibration, orientations and velocities follow exp(x), Â moved from ``before``."""
         chart, axes, moved = self.joint.chart, self.axes, self.joint.active
         self.calibration.shift(x[axes.p : chart.robot])
+        if chart.stride == axes.point:
+            return
         of_landmarks = x[chart.first :].reshape(-1, chart.stride)
         if chart.turn:
             turns = axes.full_turns(of_landmarks[:, axes.point : axes.point + chart.turn])
             self.observer.orientations.turn(moved, so3.exp(turns))
         if chart.velocity:
             change = axes.full_points(of_landmarks[:, -chart.velocity :])
+            D = self.observer.A @ se3.inverse(before)
             self.observer.correct_velocities(D, moved, change)
