@@ -46,7 +46,6 @@ from slam_observer_ros.tracking.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.tracking.slip import stray
 from slam_observer_ros.tracking.standing import Drift, MAX_MOTIONS, Standing, take_back
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.step import step
@@ -332,12 +331,14 @@ class Hypotheses:
         best, drift = self.best, self._drift
         if not self._can_weigh:
             return False
-        has_strayed = drift.note(best, event, update, known_ids, known_covariances)
-        if has_strayed:
-            drift.clear()
-            for hypothesis in self._all:
-                stray(hypothesis.state, update)
-        return has_strayed
+        explained = drift.note(best, event, update, known_ids, known_covariances)
+        if explained is None:
+            return False
+        for hypothesis in self._all:
+            state = hypothesis.state
+            state.slip(state.observer.A, explained)
+            state.counts['slip'] += drift.has_strayed
+        return True
 
     def _note_ambiguity(self, event: ObservationEvent) -> None:
         """Note whether points without ids fit several maps, after an observation."""

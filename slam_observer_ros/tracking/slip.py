@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimates import Update
 from slam_observer_ros.filter.robust import huber_loss
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import (
@@ -52,7 +51,7 @@ def slip(state: State, matched: MatchedObservation) -> float:
     observer, start = state.observer, state.observer.A.copy()
     points, r = matched.known.points, matched.residuals.r
     needed_s = min(_needed_s(state, points, r), MAX_DURATION_S)
-    noise = _noise(state, needed_s)
+    noise = unknown_motion(state, needed_s)
     variances = np.maximum(np.diagonal(noise)[state.axes.pose], MIN_VARIANCE)
     state.slip(_pose_after(state, matched, variances), noise)
     state.counts['slip'] += 1
@@ -65,11 +64,11 @@ def astray(state: State) -> Iterator[State]:
     for turn_rad in (0.0, TURN_RAD, -TURN_RAD):
         other = state.copy()
         turn = se3.exp(np.array([0, 0, turn_rad, 0, 0, 0]))
-        other.slip(other.observer.A @ turn, _noise(other, SHORT_S))
+        other.slip(other.observer.A @ turn, unknown_motion(other, SHORT_S))
         yield other
 
 
-def _noise(state: State, duration_s: float) -> FloatArray:
+def unknown_motion(state: State, duration_s: float) -> FloatArray:
     """Return the covariance (6, 6) of a motion without odometry for so long."""
     stray = HeldVelocities.unknown(np.array([duration_s]))
     return np.asarray(state.motion_noise.covariances(stray)[0])
@@ -120,15 +119,3 @@ def _likeliest_pose(
         gradient = strayed / variances + np.sum(CW @ left, axis=0)[:, 0]
         found = found @ se3.exp(-axes.full_pose(solve_symmetric(H, gradient)))
     return found
-
-
-def stray(state: State, update: Update) -> None:
-    """Let the pose be as uncertain as if odometry had said nothing for as long as that takes.
-
-    What the views do not show has been off for as long.
-    """
-    rows = state.landmarks.rows_of(update.ids)
-    points = state.observer.body_points(rows[rows >= 0])
-    needed_s = _needed_s(state, points, update.residuals[rows >= 0])
-    state.slip(state.observer.A, _noise(state, min(needed_s, MAX_DURATION_S)))
-    state.counts['slip'] += 1

@@ -3,7 +3,7 @@
 If all landmarks do, the robot stands and its wheels spin: each observation is off by too little to
 be rejected, and pose and landmarks would be dragged along. So would they if it turns and slides.
 If some landmarks do, while others pass as odometry has it, the robot carries them along: they are
-not places. In a loaded map a robot that is pushed shows in several views together: :class:`Drift`.
+not places. A push that the gate lets pass in a map shows in several views: :class:`Drift`.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from slam_observer_ros.models.point_noise import repetition_factors
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.tracking import covariances
 from slam_observer_ros.tracking.matching import calibrated
+from slam_observer_ros.tracking.slip import MIN_VARIANCE, unknown_motion
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.tags import seen_orientations
 
@@ -77,22 +78,18 @@ At the start for half of that.
 UNSEEN_NS = to_ns(1.0)
 """For how long a slip goes on unseen."""
 
+WINDOWS_S = np.array([0.3, 1.0, 3.0])
+"""Times, seconds, after which a view counts for a third: a robot may be pushed fast or slowly."""
+
 STRAYED = 2.0 * CLEAR
-"""Deviations of the last views together beyond which the pose is wrong: as sensors are often twice
-as noisy as stated, a healthy robot is off by more than :data:`CLEAR` at times.
+"""Deviations of all windows that contradict the pose, one after the other: it is said then.
+
+One that is :data:`CLEAR` only makes the pose less sure. In the plane honest noise is as far off
+once in a hundred hours, in space once in some; noise twice as large as stated often.
 """
 
 MAX_MOTIONS = 500
 """Motions between observations that are remembered."""
-
-LASTING_SHARE = 0.95
-"""Of what views before count, at most: views within milliseconds have an error in common."""
-
-RECENT_S, PAUSE_S = 0.3, 1.0
-"""Time, seconds, after which a view counts for a third; and after which none before it counts.
-
-A robot that is pushed is then noticed before a second is over.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -482,25 +479,37 @@ class Standing:
 
 
 class Drift:
-    """Whether the last views together put the robot where it can't be, each being within the gate.
+    """What the innovations of the last views say together, each being within the gate.
 
     With C_i = [−[ȳ_i]×, I] about the robot, an error ε of its pose gives landmarks of a map the
-    residuals r_i = C_i ε + noise, and the turns of tags C = [I, 0]. g = Σ Cᵀ R⁻¹ r over the last
-    views is then H ε + noise of the covariance V, H = Σ Cᵀ R⁻¹ C, and rarely larger than
-    S = H P H + V says. R is the noise while driving: what lasts while the robot stands is in all
-    of its views, and no news. The map's errors are the same in each of the last views.
+    residuals r_i = C_i ε + noise, R_i of sensor and map, and the turns of tags C = [I, 0]. With
+    W = Σ Cᵀ R⁻¹ C and S = C P Cᵀ + R, a view says
+
+        u = Cᵀ S⁻¹ r = (I + W P)⁻¹ Σ Cᵀ R⁻¹ r,   of covariance   G = Cᵀ S⁻¹ C = (I + W P)⁻¹ W,
+
+    and is independent of the views before it, as long as all noise is as stated. Summed over a
+    window, m = Σ λ u and M = Σ λ² G, mᵀ M⁻¹ m is χ² of p then. If in truth the robot moves
+    otherwise by δ from each view to the next, m is about L δ, L = Σ λ G. R is the noise while
+    driving: what lasts while the robot stands, the pose has adapted to.
     """
 
     def __init__(self) -> None:
         self.is_followed = False  # nowhere but in a map
+        self.has_strayed = False  # the last contradiction leaves no doubt that it moves otherwise
         self.clear()
 
     def clear(self) -> None:
         """Begin again, as the pose has changed otherwise."""
-        # The pose (4, 4) before the present view, and the covariance (6, 6) of ε.
+        # The pose (4, 4) before the present view, and the covariance (6, 6) of its error ε.
         self.before: tuple[FloatArray, FloatArray] | None = None
-        self._stamp_ns = 0
-        self._g, self._H, self._V = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
+        self._position = np.zeros(3)
+        self._stamp_ns = self._contradicted_ns = 0
+        self._squares = 0.0  # of all contradictions, one after the other
+        self._begin()
+
+    def _begin(self) -> None:
+        w = len(WINDOWS_S)
+        self._m, self._M, self._L = np.zeros((w, 6)), np.zeros((w, 6, 6)), np.zeros((w, 6, 6))
 
     def note(
         self,
@@ -509,83 +518,110 @@ class Drift:
         update: Update,
         known_ids: IntArray,
         known_covariances: FloatArray | None,
-    ) -> bool:
-        """Take what an observation did; return whether the pose must be wrong by the last views.
+    ) -> FloatArray | None:
+        """Take what an observation did; return how uncertain a pose is that views contradict.
 
-        Landmarks ``known_ids`` (n,) are in a map, with ``known_covariances`` (n, 3, 3), m², or
-        None if it is exact.
+        The covariance (6, 6) of a motion that explains them, body frame; None if nothing has to
+        be explained. Landmarks ``known_ids`` (n,) are in a map, with ``known_covariances``
+        (n, 3, 3), m², or None if it is exact.
         """
         self.is_followed = True
         elapsed_s = to_s(max(update.stamp_ns - self._stamp_ns, 0))
         before, self.before = self.before, None
-        if elapsed_s > PAUSE_S:
+        if elapsed_s > WINDOWS_S[-1]:
             self.clear()
         self._stamp_ns = update.stamp_ns
         # Which of the points seen, in the order of the event, were taken for a landmark.
         seen = np.isin(event.ids, update.ids) | (event.ids == UNKNOWN_ID)
         is_whole = event.kinds is None and np.count_nonzero(seen) == len(update.ids)
         if before is None or not is_whole:
-            return False
+            return None
         rows, in_map = state.landmarks.rows_of(update.ids), known_ids == update.ids[:, None]
         used = (rows >= 0) & ~update.rejected & in_map.any(axis=1)
         if not used.any():
-            return False
+            return None
         event = replace(calibrated(state, event).select(seen).select(used), sensed=None)
         rows, in_map = rows[used], in_map[used]
-        observer, pose = state.observer, state.axes.pose
-        P = covariances.of_pose(observer, before[1], observer.A)[pose, pose]
-        # Of each the sensor's error, as often as it is new, and the map's, for all of the views.
-        share = math.exp(-elapsed_s / RECENT_S)
-        views = 1.0 / (1.0 - min(share, LASTING_SHARE))
+        observer, axes, (A, P) = state.observer, state.axes, before
+        pose, k, p, R = axes.pose, axes.point, axes.p, A[:3, :3]
+        P = covariances.of_pose(observer, P, se3.inverse(observer.reference_pose) @ A)[pose, pose]
         lasting = state.settings.observation_correlation_time
         repeated = repetition_factors(np.array([elapsed_s]), lasting)
-        k, p, R = state.axes.point, state.axes.p, observer.pose[:3, :3]
         noise = repeated * (R @ state.observation_noise.covariances(event) @ R.T)
         if known_covariances is not None:
-            noise += views * known_covariances[in_map.argmax(axis=1)]
-        C = state.axes.output_matrix(observer.body_points(rows) @ R.T)
-        parts = [(C, noise[:, :k, :k], update.residuals[used, :k])]
+            noise += known_covariances[in_map.argmax(axis=1)]
+        r = se3.transform(A, event.points) - observer.world_points[rows]
+        parts = [(axes.output_matrix(event.points @ R.T - 0.5 * r), noise[:, :k, :k], r[:, :k])]
         if (tags := seen_orientations(state, event, rows)) is not None:
-            parts.append(_turned(state, tags, repeated, views))
-        H, g = share * self._H[:p, :p], share * self._g[:p]
-        V = share**2 * self._V[:p, :p]
+            parts.append(_turned(state, tags, R, repeated))
+        W, w = np.zeros((p, p)), np.zeros(p)
         for C, noise, r in parts:
             # No view of one landmark says more than a few: it may be an outlier.
             far = mahalanobis(r, noise + C @ P @ transpose(C))
             r = np.minimum(1.0, CLEAR / np.maximum(far, CLEAR))[:, None] * r
             CW = transpose(solve_symmetric(noise, C))
-            h = np.sum(CW @ C, axis=0)
-            H, V, g = H + h, V + h, g + np.sum(CW @ r[:, :, None], axis=0)[:, 0]
-        # What the correction has taken from ε, the views so far no longer show.
-        turn = so3.log(observer.pose[:3, :3] @ before[0][:3, :3].T)
-        moved = np.append(turn, observer.pose[:3, 3] - before[0][:3, 3])[pose]
-        self._g, self._H, self._V = g + H @ moved, H, V
-        S = H @ P @ H + V
-        if not np.isfinite(S).all():
-            return False
+            W, w = W + np.sum(CW @ C, axis=0), w + np.sum(CW @ r[:, :, None], axis=0)[:, 0]
+        back = np.linalg.inv(np.eye(p) + W @ P)
+        # What was said of the pose where the robot was, is said of it where it is.
+        there = np.eye(6)
+        there[3:, :3] = so3.hat(A[:3, 3] - self._position)
+        there, self._position = there[pose, pose], A[:3, 3].copy()
+        share = np.exp(-elapsed_s / WINDOWS_S)[:, None]
+        m, M, L = self._m[:, :p], self._M[:, :p, :p], self._L[:, :p, :p]
+        self._m = m = share * (m @ there) + back @ w
+        self._M = M = share[:, None] ** 2 * (there.T @ M @ there) + back @ W
+        self._L = L = share[:, None] * (there.T @ L @ there) + back @ W
+        if not np.isfinite(M).all():
+            return None
         # Along directions that no view has shown, both are zero.
-        scale = np.sqrt(np.maximum(np.diagonal(S), np.finfo(np.float64).tiny))
-        scaled = g / scale
-        inverse = np.linalg.pinv(S / np.outer(scale, scale), rcond=1e-9, hermitian=True)
-        return bool(scaled @ inverse @ scaled > STRAYED**2)
+        scales = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), np.finfo(np.float64).tiny))
+        scaled = m / scales
+        M = M / (scales[:, :, None] * scales[:, None]) + 1e-9 * np.eye(p)
+        squares = np.sum(scaled * np.linalg.solve(M, scaled[:, :, None])[:, :, 0], axis=1)
+        at = int(np.argmax(squares))
+        if squares[at] <= CLEAR**2:
+            return None
+        is_first = update.stamp_ns - self._contradicted_ns > to_ns(WINDOWS_S[-1])
+        earlier = 0.0 if is_first else self._squares
+        self._squares, self._contradicted_ns = earlier + float(squares[at]), update.stamp_ns
+        self.has_strayed = earlier <= STRAYED**2 < self._squares
+        self._begin()
+        turn = block_diag(observer.pose[:3, :3], observer.pose[:3, :3])
+        explained = axes.full_pose_covariance(_explained(state, m[at], L[at]))
+        return np.asarray(turn.T @ explained @ turn)
+
+
+def _explained(state: State, m: FloatArray, L: FloatArray) -> FloatArray:
+    """Return δ δᵀ and the covariance of δ, (p, p), the motion that explains sums over a window.
+
+    As of a motion without odometry, for as long as that takes.
+    """
+    unknown = np.maximum(np.diagonal(unknown_motion(state, 1.0))[state.axes.pose], MIN_VARIANCE)
+    taken_s = 1.0
+    for _ in range(2):
+        covariance = np.linalg.inv(L + np.diag(1.0 / (taken_s * unknown)))
+        delta = covariance @ m
+        taken_s = float(np.mean((delta**2 + np.diagonal(covariance)) / unknown))
+    return np.outer(delta, delta) + covariance
 
 
 def _turned(
-    state: State, tags: SeenOrientations, repeated: FloatArray, views: float
+    state: State, tags: SeenOrientations, R: FloatArray, repeated: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return C (t, q, p), noise (t, q, q) and residuals (t, q) of tags' turns, about the world.
 
-    Of each tag the orientation counts that fits better, of two that look nearly the same; none
-    that was rejected: the map may have other axes than the detector.
+    ``R`` (3, 3) turned the body before they were used. Of each tag the orientation counts that
+    fits better, of two that look nearly the same; none that was rejected: the map may have other
+    axes than the detector.
     """
-    known, R = state.observer.orientations, state.observer.pose[:3, :3]
+    known = state.observer.orientations
     is_used = known.are_known[tags.rows] & (known.rejections[tags.rows] == 0)
     tags = tags.select(tags.Z.any(axis=(1, 2)) & is_used)
     B = state.observer.reference_pose[:3, :3] @ known.B[tags.rows]
     both = so3.log(R @ np.array([tags.Z, tags.flipped]) @ transpose(B))
     nearer = np.argmin(np.sum(both**2, axis=2), axis=0)
     of_map = known.map_sigmas[tags.rows, None, None] ** 2 * np.eye(3)
-    noise = repeated * (R @ tags.covariances @ R.T) + views * of_map
+    noise = repeated * (R @ tags.covariances @ R.T) + of_map
     axes, C = state.axes, np.zeros((len(tags.rows), state.axes.turn, state.axes.p))
     C[:, :, : axes.turn] = np.eye(axes.turn)
     turns = both[nearer, np.arange(len(nearer))]

@@ -153,7 +153,11 @@ SIDEWAYS, BACK = np.eye(6)[4], np.eye(6)[3] * -1.0
     ('odometry', 'true', 'rows'),
     [
         pytest.param(STANDS, 0.5 * SIDEWAYS, [0, 1, 2], id='pushed aside'),
+        pytest.param(STANDS, 0.07 * SIDEWAYS, [0, 1, 2], id='pushed aside slowly'),
         pytest.param(STANDS, 0.3 * BACK, [0, 1, 2], id='pushed back'),
+        pytest.param(V, V + 0.5 * SIDEWAYS, [0, 1, 2], id='pushed aside in a drive'),
+        pytest.param(0.15 * np.eye(6)[3], STANDS, [0, 1, 2], id='wheels spin slowly'),
+        pytest.param(0.15 * np.eye(6)[3], STANDS, [0], id='wheels spin slowly, one in view'),
         pytest.param(STANDS, 0.3 * BACK, [0], id='pushed back, one in view'),
         pytest.param(0.5 * np.eye(6)[3], STANDS, [0], id='wheels spin, one in view'),
         pytest.param(ON_THE_SPOT, STANDS, [0, 1, 2], id='wheels turn on the spot'),
