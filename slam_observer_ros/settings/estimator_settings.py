@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, InitVar
 
 from slam_observer_ros.settings.parameter_table import parameter, Pose6
 
@@ -486,6 +486,18 @@ class Settings:
         minimum=0.0,
         maximum=1000.0,
     )
+    # What scripts of snapshots before 0.1.0 state in place of initial_pose; no parameters.
+    initial_position: InitVar[Vector3 | None] = None
+    initial_yaw: InitVar[float | None] = None
+
+    def __post_init__(self, initial_position: Vector3 | None, initial_yaw: float | None) -> None:
+        """Take a pose at the start that is stated in parts."""
+        if initial_position is None and initial_yaw is None:
+            return
+        x, y, z = initial_position or self.initial_pose[:3]
+        roll, pitch, yaw = self.initial_pose[3:]
+        yaw = yaw if initial_yaw is None else initial_yaw
+        object.__setattr__(self, 'initial_pose', (x, y, z, roll, pitch, yaw))
 
 
 class LiveSettings(Settings):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 import math
 from pathlib import Path
 
@@ -446,3 +446,11 @@ def test_what_a_file_has_twice_is_refused_by_its_name(tmp_path, text, twice):
     with pytest.raises(ParameterError) as error:
         read_parameter_file(write(tmp_path, text))
     assert f"'{twice}' is there 2 times" in str(error.value)
+
+
+def test_scripts_may_state_the_pose_at_the_start_in_parts():
+    """Scripts of snapshots before 0.1.0 do so; files state ``initial_pose``."""
+    found = Settings(initial_position=(1.0, 2.0, 3.0), initial_yaw=0.5)
+    assert found.initial_pose == (1.0, 2.0, 3.0, 0.0, 0.0, 0.5)
+    assert replace(found, gain_k=2.0).initial_pose == found.initial_pose
+    assert 'initial_yaw' not in {row.name for row in table(Settings)}
