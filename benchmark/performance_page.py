@@ -104,7 +104,7 @@ def draw(tables: Tables) -> None:
     known, seen = figure.subplots(1, 2, sharey=True)
     _draw_costs(known, tables['known'], 'landmarks known, three of them seen')
     _draw_costs(seen, tables['seen'], 'landmarks seen, of 300 known')
-    known.set_title('CPU time of a step, in those of the cheapest')
+    known.set_title('CPU time of a step, as a multiple of the cheapest')
     known.legend(fontsize=8)
     save(figure, PICTURE)
 

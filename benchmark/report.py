@@ -381,7 +381,7 @@ def _draw_ratios(axes: Axes, table: Table) -> None:
         positions, [fill(world, 12, break_long_words=False) for world in table], fontsize=8
     )
     axes.set_xlim(-0.5, len(table) - 0.5)
-    axes.set_title('Configuration error as a multiple of that of iSAM2')
+    axes.set_title("Configuration error as a multiple of iSAM2's")
     axes.legend(ncols=len(DRAWN), fontsize=8)
 
 

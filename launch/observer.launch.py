@@ -44,7 +44,7 @@ def generate_launch_description():
                 'namespace', default_value='', description='namespace of the robot'
             ),
             DeclareLaunchArgument(
-                'use_sim_time', default_value='false', description='whether time is that of /clock'
+                'use_sim_time', default_value='false', description='whether /clock gives the time'
             ),
             OpaqueFunction(function=check_file, args=['params_file']),
             Node(

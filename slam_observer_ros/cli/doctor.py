@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> None:
     rows = {topic['topic']: topic['text'] for topic in topics}
     print_table(
         f'Topics heard for {args.seconds:g} s',
-        rows or {'none': 'with velocities or landmarks; is ROS_DOMAIN_ID that of the robot?'},
+        rows or {'none': "with velocities or landmarks; is ROS_DOMAIN_ID the robot's?"},
     )
 
 

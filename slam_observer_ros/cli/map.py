@@ -79,7 +79,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=_deviation,
         default=0.03,
         metavar='RAD',
-        help="that of a tag's orientation about each axis, radians (default 0.03: put up by eye)",
+        help="standard deviation of a tag's orientation about each axis, radians (default 0.03: "
+        'put up by eye)',
     )
     convert.add_argument(
         '--tag-axes',

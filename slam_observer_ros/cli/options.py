@@ -273,7 +273,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         type=named,
         metavar='FRAME',
         help='frame whose pose is estimated; other sensors are placed in it by /tf and '
-        '/tf_static (default: that of the velocities, or base_link if they name none)',
+        "/tf_static (default: the velocities' frame, or base_link if they name none)",
     )
     inputs.add_argument(
         '--tag-frame-prefix',

@@ -52,14 +52,13 @@ KINDS = {
     ),
     'no_observation': Kind(
         Level.WARNING,
-        'no observation was used (dropped: {dropped}): the trajectory is that of the velocities '
-        'alone',
+        'no observation was used (dropped: {dropped}): the velocities alone gave the trajectory',
         'see why they were dropped (Troubleshooting)',
     ),
     'no_angular_velocity': Kind(
         Level.WARNING,
-        'no angular velocity of {topic} was used (dropped: {dropped}): that of {instead} was '
-        'taken',
+        'no angular velocity of {topic} was used (dropped: {dropped}): the one of '
+        '{instead} was taken',
         'see why they were dropped (Troubleshooting)',
     ),
     'unused_input': Kind(
@@ -160,8 +159,8 @@ KINDS = {
     ),
     'other_clock': Kind(
         Level.WARNING,
-        'stamps of {topic} are {offset_s:.1f} s {side} those of {other}, by when both were '
-        'received',
+        'stamps of {topic} are {offset_s:.1f} s {side} the stamps of {other}, by when both '
+        'were received',
         'synchronise the clocks; a node with correct_clock_offset takes this recording, played '
         'with --clock, as it is',
     ),
@@ -239,7 +238,7 @@ KINDS = {
     ),
     'velocity_frame': Kind(
         Level.WARNING,
-        "velocities in frame '{frame}' are taken to be those of '{base_frame}' until their "
+        "velocities in frame '{frame}' are taken as if in '{base_frame}' until their "
         'transform is known: {error}',
         'let /tf or /tf_static have it',
     ),

@@ -64,7 +64,7 @@ def numbers(given: Mapping[str, str], name: str, count: int) -> list[float]:
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of the robot'),
-    'use_sim_time': ('false', 'whether time is that of /clock'),
+    'use_sim_time': ('false', 'whether /clock gives the time'),
     'autostart': ('true', 'whether the nodes are configured and activated at once'),
     'use_respawn': ('false', 'whether nodes that have ended are started again'),
     'log_level': ('info', 'least severity that is logged'),

@@ -458,8 +458,8 @@ def _warn_of_misplaced(node: Node, names: Collection[str]) -> None:
             continue
         if sections:
             node.get_logger().warning(
-                f"parameter file {path} has nothing for '{full_name}'; are those of "
-                f"'{sections[0]}' meant for it?"
+                f"parameter file {path} has nothing for '{full_name}'; are the values "
+                f"under '{sections[0]}' meant for it?"
             )
 
 

@@ -256,7 +256,7 @@ class MapServices:
                 return 0
             age_s = time.monotonic() - self._recent_s
             answer = self._answer(Trigger.Response(), lambda path: self._write(path, *recent))
-            log.warning(f'stopped within an observation: the map is that of {age_s:.1f} s before')
+            log.warning(f'stopped within an observation: the map was made {age_s:.1f} s before')
             return 0 if answer.success else 1
 
     def _check_changes(self, changes: list[Parameter]) -> SetParametersResult:

@@ -512,7 +512,7 @@ def _true_graph(path: Path | None, numbers: Sequence[int]) -> tuple[FloatArray, 
         return np.empty((0, 4, 4)), LandmarkTruth(np.empty(0, dtype=np.int64), np.empty((0, 3)))
     graph = _Graph(path)
     if graph.numbers != numbers:
-        raise DataSetError(f'{path}: its poses are not those of the graph')
+        raise DataSetError(f"{path}: its poses differ from the graph's")
     poses = _poses_along(graph.steps())
     world_points: dict[int, FloatArray] = {}
     for number, pose in zip(graph.numbers, poses, strict=True):

@@ -130,7 +130,7 @@ class PoseDifferences:
         self._skipped += 1
         raise InvalidEventError(
             SKIPPED,
-            f'its stamp is {to_s(duration_ns):.4f} s after that of the last pose used, where '
+            f'its stamp is {to_s(duration_ns):.4f} s after the stamp of the last pose used, where '
             f'{to_s(round(usual_ns)):.4f} s are usual: how it moved counts with the next one',
         )
 

@@ -208,7 +208,7 @@ def of_timing(recording: Recording, selected: SelectedTopics) -> Iterator[Findin
     velocity, landmarks = selected.velocity.name, selected.landmarks.name
     held = [('velocity', velocity, 'the pose was held, but for what landmarks say')]
     if selected.imu is not None:
-        held.append(('angular velocity', selected.imu.name, f'that of {velocity} was taken'))
+        held.append(('angular velocity', selected.imu.name, f'the one of {velocity} was taken'))
     for input_name, topic, consequence in held:
         if topic not in inputs:
             continue

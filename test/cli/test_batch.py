@@ -390,9 +390,7 @@ def test_the_index_links_reports_and_sorts(slam_observer, beginning, tmp_path):
 
 def test_the_index_fits_into_a_window_whatever_is_warned_of(tmp_path):
     figures = dict.fromkeys(FIGURES, 1.2345)
-    long = (
-        'Stamps of /landmarks are 1.2 s behind those of /twist, by when both were received. ' * 5
-    )
+    long = 'Stamps of /landmarks are 1.2 s behind the stamps of /twist, by when both came. ' * 5
     lines = {
         str(n): {
             **RUN,

@@ -364,8 +364,8 @@ def test_parameters_under_the_name_of_another_node_are_reported_at_the_start(ros
     )
     with running('observer_node', tmp_path / 'log', '--params-file', str(file)) as node:
         node.wait_for_output(
-            f"parameter file {file} has nothing for '/observer_node'; are those of '/slam_node' "
-            'meant for it'
+            f"parameter file {file} has nothing for '/observer_node'; are the values under "
+            "'/slam_node' meant for it"
         )
 
 

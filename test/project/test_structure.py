@@ -83,17 +83,23 @@ def test_nodes_hand_over_numbers_and_word_no_finding():
     assert called == [('ros_node.py', 'found')], 'but for what is logged as it comes'
 
 
-def test_docstrings_name_their_subjects():
-    """Of modules, classes and functions, and of constants, here and in what is not installed."""
+def test_docstrings_messages_and_pages_name_their_subjects():
+    """In the package all texts; in what is not installed, those that describe something."""
     folders = [CHECKOUT / name for name in ('benchmark', 'demo', 'scripts', 'test')]
     stand_ins = re.compile(r'\b(that|those)\s+of\b')
-    found = [
-        f'{path.name}: {node.value.value}'
-        for path, node in nodes_of(PACKAGE, *folders, holding=stand_ins)
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-        if isinstance(node.value.value, str) and stand_ins.search(node.value.value)
+    described = [
+        (path, node.value)
+        for path, node in nodes_of(*folders, holding=stand_ins)
+        if isinstance(node, ast.Expr)
     ]
-    assert found == []
+    found = [
+        f'{path.name}: {node.value}'
+        for path, node in [*nodes_of(PACKAGE, holding=stand_ins), *described]
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if stand_ins.search(node.value)
+    ]
+    pages = [*CHECKOUT.glob('docs/*.md'), CHECKOUT / 'README.md']
+    assert found + [page.name for page in pages if stand_ins.search(page.read_text())] == []
 
 
 def test_gains_are_distinguished_by_what_they_have_not_by_name():
