@@ -52,8 +52,8 @@ from slam_observer_ros.recordings.trajectory import write_tum
 from slam_observer_ros.report.batch_index import FILES, INDEX, Line, SCORES, write_index
 from slam_observer_ros.report.page import write_report
 from slam_observer_ros.report.summary import as_json, FIGURES, identity, summary_rows
+from slam_observer_ros.runs.replay import result_of
 from slam_observer_ros.runs.result import Request
-from slam_observer_ros.runs.run import result_of
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names, suggestion, table, Value

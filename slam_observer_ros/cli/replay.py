@@ -35,13 +35,14 @@ from slam_observer_ros.common.errors import (
 )
 from slam_observer_ros.common.findings import kept_warnings
 from slam_observer_ros.estimator.event_warnings import listed
+from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.mapping.map_file import map_files, write_map
 from slam_observer_ros.recordings.opening import files_of, sha256_of
 from slam_observer_ros.recordings.trajectory import write_tum
 from slam_observer_ros.report.page import write_report
 from slam_observer_ros.report.summary import as_json, identity, summary_rows
+from slam_observer_ros.runs.replay import result_of
 from slam_observer_ros.runs.result import Result, Sighting
-from slam_observer_ros.runs.run import result_of
 from slam_observer_ros.settings.node_settings import InputSettings
 
 logger = logging.getLogger(__name__)
@@ -153,8 +154,11 @@ def run(args: argparse.Namespace) -> None:
     if errors:
         raise OutputError('; '.join(errors))
     if args.explain is not None and not life:
-        seen = listed(result.seen_ids)
-        raise UsageError(f'--explain: no point had the id {args.explain}; there are {seen}')
+        ids = {each.landmark_id for each in result.run.estimator.outcomes}
+        seen = sorted(ids.union(result.innovations.ids.tolist()) - {UNKNOWN_ID})
+        raise UsageError(
+            f'--explain: no point had the id {args.explain}; there are {listed(seen)}'
+        )
     if args.strict and any(result.lost.values()):
         raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')
     if args.strict and result.unused_input:

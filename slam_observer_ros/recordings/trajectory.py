@@ -292,6 +292,11 @@ class Truth:
     tracks: LandmarkTracks | None
 
     @property
+    def trajectory(self) -> Trajectory:
+        """The true poses."""
+        return Trajectory(self.stamps_ns, self.poses)
+
+    @property
     def landmarks(self) -> LandmarkTruth | None:
         """True landmark positions at the end; None if the recording has none."""
         return None if self.tracks is None else self.tracks.at(int(self.tracks.stamps_ns[-1]))

@@ -57,7 +57,7 @@ def write_report(path: Path, result: Result, title: str, rows: Mapping[str, str]
         'title': title,
         'figures': [[name, value] for name, value in rows.items()],
         'findings': findings,
-        'warnings': [warning for warning in result.warnings if warning not in said],
+        'warnings': [warning for warning in map(str, result.logged) if warning not in said],
     }
     # In a script element only `<` could end it.
     numbers = json_text(text | report_data(result), is_compact=True).replace('<', '\\u003c')
@@ -253,7 +253,7 @@ def _errors(result: Result) -> dict[str, Json]:
     ]
     lyapunov = np.where(innovations.lyapunov > 0.0, innovations.lyapunov, np.nan)
     curves: dict[str, Json] = {
-        't': rounded(result.instants_s, 2),
+        't': rounded(result.seconds(result.instants_ns), 2),
         'bound_m': rounded(np.array(bounds_m), 3),
         'lyapunov_t': rounded(result.seconds(innovations.update_stamps_ns), 2),
         'lyapunov': rounded(np.log10(lyapunov), 2),
@@ -312,7 +312,7 @@ def _consistency(result: Result) -> dict[str, Json]:
     if not usable.any():
         return curves
     return curves | {
-        'nees_t': rounded(result.instants_s[rows[stated]][usable], 2),
+        'nees_t': rounded(result.seconds(result.instants_ns)[rows[stated]][usable], 2),
         'nees': rounded(nees[usable] / degrees[usable], 3),
         'nees_band': rounded(np.array(average_nees_band(int(degrees[usable].max()), 1)), 3),
     }
@@ -357,7 +357,15 @@ def _outcomes(result: Result) -> dict[str, Json]:
 
 def _calibration_curve(result: Result, name: str) -> dict[str, Json]:
     """Return what was estimated of a property over time, and its standard deviation."""
-    seconds, parts = result.calibration_over_time(name)
+    # What is known of a sensor begins where the sensor is heard first.
+    known = [
+        (instant.stamp_ns, part)
+        for instant in result.instants
+        for part in instant.calibration
+        if part.name == name
+    ]
+    seconds = result.seconds(np.array([stamp_ns for stamp_ns, _ in known], dtype=np.int64))
+    parts = [part for _, part in known]
     factor, unit = parts[-1].for_people
     return {
         'name': name,

@@ -47,7 +47,7 @@ def identity(recording: Path, sha256: str, result: Result) -> dict[str, object]:
         'recording_sha256': sha256,
         'version': __version__,
         'settings': {name: getattr(settings, name) for name in changed_names(settings)},
-        'warnings': result.warnings,
+        'warnings': [str(one) for one in result.logged],
     }
 
 
@@ -81,7 +81,7 @@ def as_json(result: Result) -> dict[str, object]:
         'configuration_rmse_m': accuracy.configuration_rmse_m,
         'anees': accuracy.anees,
         'configuration_anees': accuracy.configuration_anees,
-        'nis': None if result.recorder is None else result.recorder.mean_nis,
+        'nis': result.nis,
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
         'unsmoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.online_errors),
         'smoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.pose_errors),

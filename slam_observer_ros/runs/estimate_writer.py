@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+import logging
+from typing import Any, TYPE_CHECKING
 
+from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.stamps import is_due, NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import Update
@@ -16,10 +20,18 @@ from slam_observer_ros.messages.estimate_messages import (
     uncertain_pose,
 )
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.topics import SelectedTopics
 from slam_observer_ros.recordings.trajectory import LandmarkTruth
-from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.health import diagnostics
 from slam_observer_ros.runs.metrics import TrajectoryErrors
+from slam_observer_ros.runs.result import Request
+from slam_observer_ros.settings.node_settings import InputSettings, ObserverNodeSettings
+
+if TYPE_CHECKING:
+    from slam_observer_ros.recordings.writer import RecordingWriter
+
+logger = logging.getLogger(__name__)
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
@@ -158,3 +170,48 @@ class EstimateWriter:
 
     def _write(self, topic: str, message: Any, stamp_ns: int, latched: bool = False) -> None:
         self._writer.write_message(topic, message, stamp_ns, latched=latched)
+
+
+@contextmanager
+def estimate_writer(
+    request: Request,
+    recording: Recording,
+    selected: SelectedTopics,
+    inputs: InputSettings,
+    map_frame: str,
+) -> Iterator[EstimateWriter | None]:
+    """Give what writes the file of ``--mcap``, which is there when the block ends; else None."""
+    path = request.mcap
+    if path is None:
+        yield None
+        return
+    from slam_observer_ros.recordings.writer import RecordingWriter  # a while to import
+
+    base_frame = inputs.base_frame or InputSettings().base_frame
+    taken = [topic.name for topic in selected.inputs if topic.name in TOPICS]
+    with RecordingWriter(path, overwrite=request.overwrite) as writer:
+        transforms, has_parent = selected.transforms, False
+        if request.with_inputs:
+            if taken:
+                raise UsageError(
+                    f'--with-inputs: {", ".join(taken)} would be an input and an output of '
+                    f'{path}; leave it out'
+                )
+            for topic in recording.copy_to(writer, selected):
+                logger.warning('%s is left out of %s: its type is unknown.', topic, path)
+            topics = (*transforms.static, *transforms.moving)
+            has_parent = recording.contents.has_parent_of(base_frame, topics)
+        elif not recording.contents.has_parent_of(base_frame, transforms.static):
+            recording.copy_static_to(writer, selected)  # where the sensors are on the robot
+        if has_parent:
+            logger.warning(
+                "%s has no transform from '%s' to '%s': the inputs on /tf have another parent of "
+                "'%s'.",
+                path,
+                map_frame,
+                base_frame,
+                base_frame,
+            )
+        yield EstimateWriter(
+            writer, map_frame, base_frame, ObserverNodeSettings().publish_rate, not has_parent
+        )

@@ -1,4 +1,4 @@
-"""Events of a recording through the estimator, and how good what comes of it is.
+"""A recording through the estimator: from a :class:`.Request` to its :class:`.Result`.
 
 What is measured is the *online* estimate: the pose as it was known at each moment, from the events
 received until then, never smoothed. The trajectory is sampled at the stamps of velocities and
@@ -9,33 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 import logging
 import time
-from typing import ParamSpec, Protocol, runtime_checkable
+from typing import ParamSpec, Protocol, runtime_checkable, TypeAlias
 
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError, UsageError
-from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.findings import Finding, found, Level, muted_warnings
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
-from slam_observer_ros.estimates import RangePower, Smoothed, Update, used_points
+from slam_observer_ros.estimates import Reason, Smoothed, Update, used_points
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityBlock
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
+from slam_observer_ros.mapping.map_file import read_maps
 from slam_observer_ros.models.calibration import DELAY, MOVES, OF_VELOCITY, stated_of_velocity
 from slam_observer_ros.models.sensing import RangeErrors
-from slam_observer_ros.models.velocity_history import VelocityHistory
-from slam_observer_ros.recordings.trajectory import (
-    filled,
-    interpolate,
-    LandmarkTracks,
-    Trajectory,
-    Truth,
-)
+from slam_observer_ros.recordings.reader import Recording
+from slam_observer_ros.recordings.trajectory import filled, interpolate, Trajectory, Truth
+from slam_observer_ros.runs.estimate_writer import estimate_writer
 from slam_observer_ros.runs.metrics import (
     anchored_average_nees,
     ConfigurationError,
@@ -43,7 +39,10 @@ from slam_observer_ros.runs.metrics import (
     trajectory_errors,
     TrajectoryErrors,
 )
-from slam_observer_ros.runs.recorders import DeadReckoning, PoseSamples, RunRecorder
+from slam_observer_ros.runs.mistakes import mistakes
+from slam_observer_ros.runs.recorders import DeadReckoning, NisTally, PoseSamples, RunRecorder
+from slam_observer_ros.runs.result import Accuracy, Replay, Request, Result, SmoothedRun
+from slam_observer_ros.runs.run_health import judged, of_use, unused_messages
 from slam_observer_ros.settings.estimator_settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -57,58 +56,135 @@ NEES_PERIOD_NS = 5_000_000_000
 """Time between two covariances of the configuration, nanoseconds: they cost O(n³)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Replay:
-    """What came of a replay; since the last reset, if the clock jumped.
+Events: TypeAlias = Iterable[Event | VelocityBlock]
 
-    Attributes
-    ----------
-    estimator : Estimate
-        In its final state, with the map and the events dropped.
-    trajectory, pose_covariances : Trajectory, FloatArray or None
-        k poses of the online estimate, and (k, 6, 6) :attr:`.Estimator.pose_covariance` of each;
-        None without truth to compare their errors with.
-    dead_reckoning : Trajectory
-        What the velocities alone give, from the identity pose.
-    configuration : ConfigurationError
-        Gauge-free error after each observation; empty without truth.
-    seconds : float
-        CPU time of the estimator alone, without reading and measuring.
-    start_ns : int
-        Stamp of the first event that was used, nanoseconds; 0 if none was.
-    range_power : RangePower or None
-        How ranges grow with the cosine of the angle off the sensor's axis.
-    localised_ns : (int, int) or None
-        First and last stamp at which the pose in its final frame was known; None if it never was.
-    events, observations, angular_velocities : int
-        Events, dropped ones included; observations with points that were used; angular velocities
-        of an Imu that were taken in: all of them also before the last reset.
 
+def result_of(
+    request: Request, show_progress: Callable[[Events, int], Events] | None = None
+) -> Result:
+    """Replay a recording; refuse an outcome without what is asked of it.
+
+    What gives reason to warn is logged. ``show_progress`` passes on events, of so many in all.
     """
+    settings, map_path = request.settings, request.load_map
+    if settings.localization_mode != 'off' and map_path is None:
+        logger.warning(
+            "No map is loaded, so localization_mode '%s' has no effect (use --load-map).",
+            settings.localization_mode,
+        )
+    maps: Sequence[LandmarkMap] = () if map_path is None else read_maps(map_path)
+    with Recording(request.recording) as recording:
+        selected, inputs, truth = request.select_inputs(recording)
+        map_frame = maps[0].frame_id if maps else inputs.map_frame
+        events: Events = recording.blocks(selected, inputs, settings.velocity_timeout)
+        if show_progress is not None:
+            events = show_progress(events, recording.event_count(selected))
+        tally, notes = NisTally(), RunRecorder()
+        needs_poses = request.keeps_poses or request.keeps_run or len(truth.stamps_ns) > 0
 
-    estimator: Estimate
-    trajectory: Trajectory
-    pose_covariances: FloatArray | None
-    dead_reckoning: Trajectory
-    configuration: ConfigurationError
-    events: int
-    seconds: float
-    in_known_map: bool
-    start_ns: int
-    localised_ns: tuple[int, int] | None
-    range_power: RangePower | None
-    observations: int
-    angular_velocities: int
+        def look_for_mistakes() -> list[Finding]:
+            """Read the recording again, and look whether a mistake of the set-up explains it."""
+            with muted_warnings(), Recording(request.recording) as again:
+                events = again.events(selected, inputs, settings.velocity_timeout)
+                return mistakes(settings, events, maps or None)
 
-    @property
-    def resets(self) -> int:
-        """How often the estimator was reset by a jump of the clock."""
-        resets = self.estimator.settings.on_time_jump == 'reset'
-        return self.estimator.jumps if resets else 0
+        with estimate_writer(request, recording, selected, inputs, map_frame) as writer:
+            recorders: list[Recorder] = [] if writer is None else [writer]
+            recorders += [notes] if request.keeps_run else [tally] if request.keeps_nis else []
+            run = replay(events, settings, truth, maps or None, needs_poses, recorders)
+            unused = list(of_use(recording, selected, inputs, run))
+            _check_used(request, unused)
+            if maps and not run.estimator.is_localised:
+                _check_localised(request, run, maps, look_for_mistakes)
+            result = Result(
+                run,
+                selected,
+                truth,
+                measure(run, truth),
+                recording.duration_s,
+                unused_messages(recording, selected),
+                recording.contents.missing_ids(selected.landmarks),
+                recording.loss,
+                map_frame,
+                notes.innovations.mean_nis if request.keeps_run else tally.mean_nis,
+                notes.innovations,
+                notes.finish(run.estimator) if request.keeps_run else (),
+            )
+            if writer is not None:
+                writer.finish(run.estimator, result.errors, truth.landmarks)
+        findings = judged(result, recording, inputs, unused, map_path, look_for_mistakes)
+    for finding in findings:
+        if finding.level >= Level.WARNING:
+            logger.warning('%s', finding)
+    smoothed = smoothed_run(run, truth) if request.smooth else None
+    if map_frame != request.inputs.map_frame:
+        logger.warning(
+            "The map is in frame '%s', and so is what is written; the node takes it with "
+            'map_frame: %s only.',
+            map_frame,
+            map_frame,
+        )
+    return replace(result, judged=findings, smoothed=smoothed)
 
-    def seconds_until(self, stamp_ns: int) -> float:
-        """Return the time from the first event to a stamp, seconds."""
-        return to_s(stamp_ns - self.start_ns)
+
+def _check_used(request: Request, use: Sequence[Finding]) -> None:
+    """Raise a UsageError if no observation was used, and something that is asked for needs one."""
+    needs_some = request.smooth or request.keeps_map or request.load_map is not None
+    for finding in use:
+        if needs_some and finding.kind in ('no_observation', 'nothing_used'):
+            raise UsageError(
+                f'{finding.what}; --smooth, --map and --load-map need some: {finding.remedy}'
+            )
+
+
+def _check_localised(
+    request: Request,
+    run: Replay,
+    maps: Sequence[LandmarkMap],
+    look_for_mistakes: Callable[[], Sequence[Finding]],
+) -> None:
+    """Refuse an outcome that is not in the frame of the map that was loaded.
+
+    Where the pose in it was found and lost again the trajectory is still of use, but not the map:
+    a UsageError says if the pose was never found, or not at the end and the map is asked for.
+    """
+    if run.localised_ns is None:
+        why = '; '.join(map(str, look_for_mistakes())) or _never_found(run, maps)
+        raise UsageError(f'the pose in the map {request.load_map} was not found: {why}')
+    if request.keeps_map or request.smooth:
+        end_s = run.seconds_until(run.localised_ns[1])
+        raise UsageError(
+            f'the pose in the map {request.load_map} was lost after {end_s:.1f} s, and not found '
+            'again; --map and --smooth need it at the end'
+        )
+
+
+def _never_found(run: Replay, maps: Sequence[LandmarkMap]) -> str:
+    """Say why the landmarks seen did not determine the pose, and what to do."""
+    estimator, counts, settings = run.estimator, run.estimator.counts, run.estimator.settings
+    if counts['unknown_id']:
+        advice = f'; {counts["unknown_id"]} points without id take --gains riccati'
+    elif 2 * counts['repeated_id'] > counts['observed_point']:
+        advice = f'; {counts["repeated_id"]} points were {Reason.REPEATED_ID.words}'
+    elif settings.set_initial_pose:
+        advice = '; they contradict the pose that was given'
+    else:
+        advice = (
+            '. Where the start is known: --set set_initial_pose=true '
+            '--set initial_pose=[X,Y,Z,ROLL,PITCH,YAW]'
+        )
+    problem = estimator.localisation_problem
+    if problem and problem.kind in ('other_hall', 'other_ids'):
+        return f'{problem.what}; {problem.remedy}'
+    if problem and (is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)):
+        return f'{problem.what}{advice}'
+    least = 'two' if settings.two_d_mode else 'three'
+    ids = np.concatenate([known.ids for known in maps])
+    seen = np.isin(ids[~is_automatic(ids)], estimator.landmark_ids).sum()
+    return (
+        f'that takes {least} of its landmarks or more, recognised by their ids, well apart, and '
+        f'seen where the map has them; {seen} of its {len(ids)} were seen{advice}'
+    )
 
 
 class Recorder(Protocol):
@@ -161,27 +237,22 @@ class _RunningReplay:
         keep_all: bool,
         recorders: Sequence[Recorder | StampRecorder],
     ) -> None:
-        self._settings = settings
-        self._keep_all = keep_all
-        self._recorders = recorders
+        self._settings, self._keep_all, self._recorders = settings, keep_all, recorders
         self._stamp_recorders = [each for each in recorders if isinstance(each, StampRecorder)]
         self._estimator = Estimator(
             settings,
             on_update=self._untimed(self._on_update),
             on_stamps=self._untimed(self._on_stamps),
-            on_motion=self._untimed(self._on_motion),
+            on_motion=self._untimed(lambda *motion: self._dead_reckoning.advance(*motion)),
             on_jump=self._untimed(self._on_jump),
             judges_innovations=bool(recorders),
             keeps_outcomes=any(isinstance(each, RunRecorder) for each in recorders),
         )
         self._in_known_map = landmark_map is not None
-        self._in_fixed_map = self._in_known_map and settings.localization_mode == 'fixed'
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
-        self._landmark_tracks = truth.tracks if truth else None
-        self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
-        self._observations = self._used_points = self._angular_velocities = 0
-        self._events = 0
+        self._truth = truth
+        self._events = self._observations = self._used_points = self._angular_velocities = 0
         self._seconds = 0.0
         self._clear_figures()
 
@@ -197,32 +268,27 @@ class _RunningReplay:
         self._next_nees_ns = 0
 
     def add(self, event: Event | VelocityBlock) -> None:
-        if not isinstance(event, VelocityBlock):
-            self._add_event(event)
-        elif self._stamp_recorders:
+        if isinstance(event, VelocityBlock) and self._stamp_recorders:
             for velocity in event.events():
-                self._add_event(velocity)
-        else:
-            self._events += len(event)
-            start_s = time.thread_time()
-            self._estimator.add_velocities(event)
-            self._seconds += time.thread_time() - start_s
-
-    def _add_event(self, event: Event) -> None:
-        self._events += 1
+                self.add(velocity)
+            return
         if isinstance(event, ObservationEvent):
             self._ranges.note_event(event)
         start_s = time.thread_time()
-        is_taken = self._estimator.add(event)
+        if isinstance(event, VelocityBlock):
+            self._events += len(event)
+            self._estimator.add_velocities(event)
+        else:
+            self._events += 1
+            is_taken = self._estimator.add(event)
+            self._angular_velocities += is_taken and isinstance(event, AngularVelocityEvent)
         self._seconds += time.thread_time() - start_s
-        self._angular_velocities += is_taken and isinstance(event, AngularVelocityEvent)
 
     def finish(self) -> Replay:
         start_s = time.thread_time()
         self._estimator.flush()
         self._seconds += time.thread_time() - start_s
-        if self._pose_truth is not None and self._landmark_tracks is not None:
-            self._compare(self._pose_truth, self._landmark_tracks, is_nees_due=False)
+        self._compare(is_nees_due=False)
         return Replay(
             estimator=self._estimator,
             trajectory=self._samples.trajectory,
@@ -257,15 +323,10 @@ class _RunningReplay:
             recorder.note_stamp(self._estimator)
         if not self._estimator.is_localised:
             return
-        if self._localised_ns is not None:
-            first_ns = self._localised_ns[0]
-        self._localised_ns = first_ns, last_ns
+        self._localised_ns = (self._localised_ns or (first_ns,))[0], last_ns
         if self._keep_all and len(due_ns := stamps_ns[self._samples.due(stamps_ns)]):
-            has_truth = self._pose_truth is not None and len(self._pose_truth) > 0
+            has_truth = self._truth is not None and len(self._truth.stamps_ns) > 0
             self._samples.add(due_ns, *self._estimator.poses_at(due_ns, has_truth))
-
-    def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
-        self._dead_reckoning.advance(velocities, start_ns, end_ns)
 
     def _on_update(self, update: Update) -> None:
         for recorder in self._recorders:
@@ -275,14 +336,15 @@ class _RunningReplay:
         used = used_points(self._estimator.counts)
         self._observations += used > self._used_points
         self._used_points = used
-        if self._pose_truth is None or self._landmark_tracks is None:
+        if self._truth is None or self._truth.tracks is None:
             return
         # What is compared with the truth is kept; it is compared now if a covariance may be due.
         self._uncompared.append((update, known, world_points))
-        has_errors = len(known) > 0 and not self._in_fixed_map
+        in_fixed_map = self._in_known_map and self._settings.localization_mode == 'fixed'
+        has_errors = len(known) > 0 and not in_fixed_map
         is_nees_due = has_errors and update.stamp_ns >= self._next_nees_ns
         if is_nees_due or len(self._uncompared) == MOST_UNCOMPARED:
-            self._compare(self._pose_truth, self._landmark_tracks, is_nees_due)
+            self._compare(is_nees_due)
 
     def _on_jump(self) -> None:
         self._next_nees_ns = 0
@@ -291,11 +353,13 @@ class _RunningReplay:
             for recorder in self._recorders:
                 recorder.clear()
 
-    def _compare(self, poses: Trajectory, tracks: LandmarkTracks, is_nees_due: bool) -> None:
+    def _compare(self, is_nees_due: bool) -> None:
         """Compare what is kept with the truth; a covariance is known of the last of it."""
+        if self._truth is None or (tracks := self._truth.tracks) is None:
+            return
         kept, self._uncompared = self._uncompared, []
         stamps_ns = np.array([update.stamp_ns for update, *_ in kept], dtype=np.int64)
-        true_poses, covered = interpolate(poses, stamps_ns)
+        true_poses, covered = interpolate(self._truth.trajectory, stamps_ns)
         for row in np.flatnonzero(covered).tolist():
             update, ids, points = kept[row]
             covariance_of = None
@@ -318,28 +382,9 @@ STILL = 1e-12
 """Change of a pose, m and rad, below which it is rounding: a robot at rest has no bias."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Accuracy:
-    """Errors of a replay; None where the truth that it takes is not in the recording.
-
-    Poses, dead reckoning and the map are each compared after one rigid alignment of
-    their own; the configuration (:class:`.ConfigurationError`) takes none. ``anees`` of the pose
-    is also None where the gains know no covariance, and where no pose is certain to which the
-    truth could be moved: in a known map, or if the truth begins too late. ``configuration_anees``
-    needs no certain pose, but a joint covariance.
-    """
-
-    pose_errors: TrajectoryErrors | None
-    dead_reckoning_errors: TrajectoryErrors | None
-    landmark_rmse_m: float | None
-    configuration_rmse_m: float | None
-    anees: float | None
-    configuration_anees: float | None
-
-
 def measure(run: Replay, truth: Truth) -> Accuracy:
     """Compare what came of a replay with the truth."""
-    pose_truth, estimator = Trajectory(truth.stamps_ns, truth.poses), run.estimator
+    pose_truth, estimator = truth.trajectory, run.estimator
     errors = (
         _pose_errors('trajectory', run.trajectory, pose_truth),
         _pose_errors('dead reckoning', run.dead_reckoning, pose_truth),
@@ -350,21 +395,6 @@ def measure(run: Replay, truth: Truth) -> Accuracy:
         with _unknown_if_unfit('unknown_anees'):
             anees = anchored_average_nees(run.trajectory, covariances, pose_truth)
     return Accuracy(*errors, run.configuration.rmse_m, anees, run.configuration.anees)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SmoothedRun:
-    """What was smoothed, and its errors as :class:`Accuracy` has them.
-
-    The trajectory is at the stamps of the online one since the first of these observations, and
-    ``online_errors`` are of that part.
-    """
-
-    estimate: Smoothed
-    trajectory: Trajectory
-    pose_errors: TrajectoryErrors | None
-    online_errors: TrajectoryErrors | None
-    landmark_rmse_m: float | None
 
 
 def smoothed_run(run: Replay, truth: Truth) -> SmoothedRun:
@@ -382,14 +412,13 @@ def smoothed_run(run: Replay, truth: Truth) -> SmoothedRun:
             smoothed.since,
         )
     trajectory = smoothed_trajectory(smoothed, stamps_ns, run.dead_reckoning, estimator)
-    pose_truth = Trajectory(truth.stamps_ns, truth.poses)
     same = np.isin(online.stamps_ns, trajectory.stamps_ns)
     before = Trajectory(online.stamps_ns[same], online.poses[same])
     return SmoothedRun(
         smoothed,
         trajectory,
-        _pose_errors('smoothed trajectory', trajectory, pose_truth),
-        _pose_errors('trajectory before smoothing', before, pose_truth),
+        _pose_errors('smoothed trajectory', trajectory, truth.trajectory),
+        _pose_errors('trajectory before smoothing', before, truth.trajectory),
         _landmark_rmse_m(smoothed.ids, smoothed.world_points, truth),
     )
 

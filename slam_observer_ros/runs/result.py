@@ -1,4 +1,4 @@
-"""What a run is asked for, what is noted while it goes on, and all that came of it.
+"""What a run is asked for, and all that came of it: data, which ``runs/replay.py`` makes.
 
 Table, JSON, report and batch are views of a :class:`Result`, and of nothing else.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 import logging
 import math
 from pathlib import Path
@@ -18,18 +17,25 @@ import numpy as np
 
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import explained, Finding, found
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, Innovations, Instant, Outcome, Reason
+from slam_observer_ros.estimates import (
+    CalibrationEstimate,
+    Innovations,
+    Instant,
+    Outcome,
+    RangePower,
+    Reason,
+    Smoothed,
+)
+from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.estimator.placement import make_gains
-from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.lie import se3
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.sources import Loss
 from slam_observer_ros.recordings.topics import SelectedTopics, TopicNames
 from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth, Trajectory, Truth
-from slam_observer_ros.runs.metrics import pose_errors, TrajectoryErrors
-from slam_observer_ros.runs.recorders import NisTally, RunRecorder
-from slam_observer_ros.runs.replay import Accuracy, Replay, SmoothedRun
+from slam_observer_ros.runs.metrics import ConfigurationError, pose_errors, TrajectoryErrors
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import table, Value
@@ -66,10 +72,8 @@ class Request:
 
     def with_values(self, values: Mapping[str, Value]) -> Request:
         """Return the same with other values of some parameters."""
-        of_inputs: dict[str, Any] = {}
-        others: dict[str, Any] = {}
-        for name, value in values.items():
-            (of_inputs if name in INPUT_NAMES else others)[name] = value
+        of_inputs: dict[str, Any] = {n: v for n, v in values.items() if n in INPUT_NAMES}
+        others: dict[str, Any] = {n: v for n, v in values.items() if n not in INPUT_NAMES}
         return replace(
             self,
             settings=replace(self.settings, **others),
@@ -122,17 +126,98 @@ class Request:
         return '' if base_frame in world else base_frame
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What came of a replay; since the last reset, if the clock jumped.
+
+    Attributes
+    ----------
+    estimator : Estimate
+        In its final state, with the map and the events dropped.
+    trajectory, pose_covariances : Trajectory, FloatArray or None
+        k poses of the online estimate, and (k, 6, 6) :attr:`.Estimator.pose_covariance` of each;
+        None without truth to compare their errors with.
+    dead_reckoning : Trajectory
+        What the velocities alone give, from the identity pose.
+    configuration : ConfigurationError
+        Gauge-free error after each observation; empty without truth.
+    seconds : float
+        CPU time of the estimator alone, without reading and measuring.
+    start_ns : int
+        Stamp of the first event that was used, nanoseconds; 0 if none was.
+    range_power : RangePower or None
+        How ranges grow with the cosine of the angle off the sensor's axis.
+    localised_ns : (int, int) or None
+        First and last stamp at which the pose in its final frame was known; None if it never was.
+    events, observations, angular_velocities : int
+        Events, dropped ones included; observations with points that were used; angular velocities
+        of an Imu that were taken in: all of them also before the last reset.
+
+    """
+
+    estimator: Estimate
+    trajectory: Trajectory
+    pose_covariances: FloatArray | None
+    dead_reckoning: Trajectory
+    configuration: ConfigurationError
+    events: int
+    seconds: float
+    in_known_map: bool
+    start_ns: int
+    localised_ns: tuple[int, int] | None
+    range_power: RangePower | None
+    observations: int
+    angular_velocities: int
+
+    def seconds_until(self, stamp_ns: int) -> float:
+        """Return the time from the first event to a stamp, seconds."""
+        return to_s(stamp_ns - self.start_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accuracy:
+    """Errors of a replay; None where the truth that it takes is not in the recording.
+
+    Poses, dead reckoning and the map are each compared after one rigid alignment of
+    their own; the configuration (:class:`.ConfigurationError`) takes none. ``anees`` of the pose
+    is also None where the gains know no covariance, and where no pose is certain to which the
+    truth could be moved: in a known map, or if the truth begins too late. ``configuration_anees``
+    needs no certain pose, but a joint covariance.
+    """
+
+    pose_errors: TrajectoryErrors | None
+    dead_reckoning_errors: TrajectoryErrors | None
+    landmark_rmse_m: float | None
+    configuration_rmse_m: float | None
+    anees: float | None
+    configuration_anees: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedRun:
+    """What was smoothed, and its errors as :class:`Accuracy` has them.
+
+    The trajectory is at the stamps of the online one since the first of these observations, and
+    ``online_errors`` are of that part.
+    """
+
+    estimate: Smoothed
+    trajectory: Trajectory
+    pose_errors: TrajectoryErrors | None
+    online_errors: TrajectoryErrors | None
+    landmark_rmse_m: float | None
+
+
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
+
+MIN_GAP_S = 3.0
+"""Shortest stretch without a used landmark that is marked."""
 
 
 def list_dropped(dropped: Mapping[str, int]) -> str:
     """Return how many events were dropped, by reason, as text."""
     return ', '.join(f'{count} {reason}' for reason, count in dropped.items()) or 'none'
-
-
-MIN_GAP_S = 3.0
-"""Shortest stretch without a used landmark that is marked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,46 +230,25 @@ class Sighting:
     what: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """All that came of a recording.
-
-    Attributes
-    ----------
-    run : Replay
-        Final state, online trajectory and counts.
-    duration_s : float
-        Time that the recording spans.
-    unused : Counter
-        Messages that did not become events, by reason.
-    missing_ids : str
-        What :meth:`.Contents.missing_ids` says of the landmarks.
-    map_frame : str
-        Frame of what is written.
-    recorder : RunRecorder, NisTally or None
-        What was noted; a page and the life of a landmark need a RunRecorder.
-    smoothed : SmoothedRun or None
-        Trajectory and map smoothed, if that was asked for.
-    judged : sequence of Finding
-        What is wrong with recording and estimate.
-    logged : sequence of Finding or str
-        What was logged on the way.
-
-    """
+    """All that came of a recording."""
 
     run: Replay
     selected: SelectedTopics
     truth: Truth
     accuracy: Accuracy
-    duration_s: float
-    unused: Counter[str]
-    missing_ids: str
+    duration_s: float  # that the recording spans
+    unused: Counter[str]  # messages that did not become events, by reason
+    missing_ids: str  # what Contents.missing_ids says of the landmarks
     loss: Loss
-    map_frame: str
-    recorder: RunRecorder | NisTally | None
-    smoothed: SmoothedRun | None = None
-    judged: Sequence[Finding] = ()
-    logged: Sequence[Finding | str] = ()
+    map_frame: str  # of what is written
+    nis: float | None  # per degree of freedom, over the run
+    innovations: Innovations  # all residuals, where the run was kept
+    instants: Sequence[Instant]  # where it was, its states, the last one at its end
+    smoothed: SmoothedRun | None = None  # where that was asked for
+    judged: Sequence[Finding] = ()  # what is wrong with recording and estimate
+    logged: Sequence[Finding | str] = ()  # on the way
 
     @property
     def settings(self) -> Settings:
@@ -194,14 +258,10 @@ class Result:
     @property
     def findings(self) -> list[Finding]:
         """What is wrong, the worst first, without what another finding explains."""
-        others = [one for one in self.logged if isinstance(one, Finding)]
-        others = [one for one in others if one not in self.judged]
+        others = [
+            one for one in self.logged if isinstance(one, Finding) and one not in self.judged
+        ]
         return sorted(explained([*self.judged, *others]), key=lambda each: -each.level)
-
-    @property
-    def warnings(self) -> list[str]:
-        """All that was logged, as text."""
-        return [str(one) for one in self.logged]
 
     @property
     def events(self) -> int:
@@ -248,24 +308,6 @@ class Result:
             return None
         return self.run.seconds_until(localised_ns[0])
 
-    @cached_property
-    def instants(self) -> tuple[Instant, ...]:
-        """States of the run, the last one at its end; that one alone without a RunRecorder."""
-        recorder = self.recorder if isinstance(self.recorder, RunRecorder) else RunRecorder()
-        return recorder.finish(self.run.estimator)
-
-    @cached_property
-    def innovations(self) -> Innovations:
-        """All residuals, as a RunRecorder has noted them."""
-        recorder = self.recorder if isinstance(self.recorder, RunRecorder) else RunRecorder()
-        return recorder.innovations
-
-    @property
-    def seen_ids(self) -> list[int]:
-        """Ids that points had, ascending."""
-        others = {each.landmark_id for each in self.run.estimator.outcomes}
-        return sorted(others.union(self.innovations.ids.tolist()) - {UNKNOWN_ID})
-
     def life(self, landmark_id: int) -> list[Sighting]:
         """Return what came of each observation of a landmark, and of itself, by time."""
         seen, lines = self.innovations, []
@@ -274,10 +316,9 @@ class Result:
             what = 'used' if weight == 1.0 else f'used with weight {weight:.2f}'
             if weight == 0.0:
                 what = Reason.REJECTED.words
-            seconds = float(self.seconds(seen.stamps_ns[row]))
-            lines.append(
-                Sighting(seconds, float(seen.distances[row]), float(seen.residuals_m[row]), what)
-            )
+            seconds = self.run.seconds_until(int(seen.stamps_ns[row]))
+            figures = float(seen.distances[row]), float(seen.residuals_m[row])
+            lines.append(Sighting(seconds, *figures, what))
         for each in self.without_residual:
             if each.landmark_id == landmark_id:
                 seconds = self.run.seconds_until(each.stamp_ns)
@@ -297,35 +338,17 @@ class Result:
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Return times since the first event of the run, seconds."""
-        seconds: FloatArray = (stamps_ns - self.run.start_ns) / 1e9
-        return seconds
+        return np.asarray((stamps_ns - self.run.start_ns) / 1e9)
 
     @property
-    def instants_s(self) -> FloatArray:
-        """(i,) times of the instants, seconds."""
-        return self.seconds(self._instants_ns)
-
-    @property
-    def _instants_ns(self) -> IntArray:
+    def instants_ns(self) -> IntArray:
+        """(i,) stamps of the instants."""
         return np.array([instant.stamp_ns for instant in self.instants], dtype=np.int64)
 
     @property
     def calibration(self) -> Sequence[CalibrationEstimate]:
         """What was found out about the velocity in the end."""
         return self.instants[-1].calibration if self.instants else ()
-
-    def calibration_over_time(self, name: str) -> tuple[FloatArray, list[CalibrationEstimate]]:
-        """Return when a property was estimated, seconds, and what was known of it at each time.
-
-        That of a sensor begins where the sensor is heard first.
-        """
-        known = [
-            (row, part)
-            for row, instant in enumerate(self.instants)
-            for part in instant.calibration
-            if part.name == name
-        ]
-        return self.instants_s[[row for row, _ in known]], [part for _, part in known]
 
     @property
     def used_s(self) -> FloatArray:
@@ -336,7 +359,7 @@ class Result:
     @property
     def gaps_s(self) -> FloatArray:
         """(g, 2) beginnings and ends of the stretches in which no landmark was used, seconds."""
-        edges_s = np.concatenate([[0.0], self.used_s, self.instants_s[-1:]])
+        edges_s = np.concatenate([[0.0], self.used_s, self.seconds(self.instants_ns)[-1:]])
         is_gap = np.diff(edges_s) >= MIN_GAP_S
         return np.column_stack([edges_s[:-1][is_gap], edges_s[1:][is_gap]])
 
@@ -356,9 +379,7 @@ class Result:
         """
         if self.errors is None or self.run.in_known_map:
             return None
-        true_poses, covered = interpolate(
-            Trajectory(self.truth.stamps_ns, self.truth.poses), self._instants_ns
-        )
+        true_poses, covered = interpolate(self.truth.trajectory, self.instants_ns)
         rows = np.flatnonzero(covered).astype(np.int64)
         if not len(rows):
             return None

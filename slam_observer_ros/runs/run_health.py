@@ -25,7 +25,7 @@ from slam_observer_ros.recordings.decoding import input_decoders
 from slam_observer_ros.recordings.event_builder import NO_TRANSFORM
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import SelectedTopics
-from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
+from slam_observer_ros.recordings.trajectory import interpolate
 from slam_observer_ros.runs.health import (
     of_all_learnt,
     of_estimate,
@@ -38,9 +38,7 @@ from slam_observer_ros.runs.health import (
     of_stamps,
 )
 from slam_observer_ros.runs.metrics import TrajectoryErrors
-from slam_observer_ros.runs.recorders import RunRecorder
-from slam_observer_ros.runs.replay import Replay
-from slam_observer_ros.runs.result import list_dropped, MALFORMED, Result
+from slam_observer_ros.runs.result import list_dropped, MALFORMED, Replay, Result
 from slam_observer_ros.settings.node_settings import (
     InputSettings,
     ObserverNodeSettings,
@@ -65,7 +63,7 @@ def judged(
     findings += of_recording(recording, selected, inputs, run)
     findings += _of_run(result)
     findings += of_timing(recording, selected)
-    if isinstance(result.recorder, RunRecorder):
+    if result.instants:
         findings += of_errors(result)
     reasons = [*findings, *of_all_learnt(run.estimator)]
     if run.estimator.counts['slip'] or any(each.kind in SUSPICIOUS for each in reasons):
@@ -88,8 +86,7 @@ def _of_run(result: Result) -> Iterator[Finding]:
             yield replace(finding, start_s=start_s, end_s=end_s)
         else:
             yield finding
-    nis = None if result.recorder is None else result.recorder.mean_nis
-    yield from of_fit(None if nis is None else math.sqrt(nis))
+    yield from of_fit(None if result.nis is None else math.sqrt(result.nis))
     if run.in_known_map and estimator.settings.localization_mode != 'off':
         yield from of_map(counts, is_start_given=estimator.settings.set_initial_pose)
     # These were logged when they happened.
@@ -164,9 +161,9 @@ def of_recording(
     recording: Recording, selected: SelectedTopics, inputs: InputSettings, run: Replay
 ) -> Iterator[Finding]:
     """Judge what was read, to its end: damage, stamps, and an odometry's poses."""
-    if run.resets:
+    if run.estimator.jumps and run.estimator.settings.on_time_jump == 'reset':
         seconds = run.seconds_until(run.estimator.stamp_ns or 0)
-        yield found('clock_jumped', seconds=seconds, count=run.resets)
+        yield found('clock_jumped', seconds=seconds, count=run.estimator.jumps)
     if recording.loss and not recording.warning:
         yield found('damaged', path=recording.path, loss=recording.loss)
     yield from of_stamps(recording.unstamped)
@@ -383,7 +380,7 @@ def _of_axes(result: Result) -> Iterator[Finding]:
             delay_ns = to_ns(part.value)
     first_ns, last_ns = reckoned.stamps_ns[[0, -1]].tolist()
     edges_ns = np.arange(first_ns, last_ns, WINDOW_NS, dtype=np.int64)
-    true, is_true = interpolate(Trajectory(result.truth.stamps_ns, result.truth.poses), edges_ns)
+    true, is_true = interpolate(result.truth.trajectory, edges_ns)
     measured, is_measured = interpolate(reckoned, edges_ns - delay_ns)
     both = is_true & is_measured
     usable = both[1:] & both[:-1]
