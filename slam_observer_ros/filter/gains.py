@@ -285,6 +285,13 @@ class Gains(ABC):
         turned = observer.turned(covariances)
         return Residuals(rows, e, r, observer.a[rows], turned, dt_s, repeated, D)
 
+    def learn_bias(self, angular_velocity: FloatArray, variances: FloatArray) -> bool:
+        """Take an angular velocity (3,), rad/s, measured at rest for the bias of turning.
+
+        Return whether that was used.
+        """
+        return False
+
     # Landmarks and sensors
 
     def add(

@@ -246,6 +246,12 @@ class Calibration:
         rates: FloatArray = with_moves(measured_velocities).take(self._columns, axis=1)
         return rates
 
+    def turning_biases(self) -> tuple[IntArray, IntArray]:
+        """Return which of the c entries are biases of turning, and about which axes."""
+        places = self._places[: self.of_velocity]
+        entries = np.flatnonzero((places < DELAY // 2) & (places % 7 == MOVES))
+        return entries, places[entries] // 7
+
     def initial_covariance(self) -> FloatArray:
         """Return the covariance (p + c, p + c) of (ε, c̃) at the start, without error of Â."""
         return np.diag(np.append(np.zeros(self.axes.p), self.initial_variances))

@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, fields, replace
 import math
 from statistics import median_low
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -53,6 +53,28 @@ FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
 
 
+class Rest(NamedTuple):
+    """The mean of n angular velocities of a gyroscope while the robot stands."""
+
+    angular_velocity: FloatArray  # (3,) rad/s
+    variances: FloatArray  # (3,) of a single one, as stated; zero if unknown
+    taken: int  # n
+    begin_ns: int
+    end_ns: int
+
+    def joined(self, other: Rest) -> Rest:
+        """Return the mean of both."""
+        n = self.taken + other.taken
+        share = other.taken / n
+        return Rest(
+            (1.0 - share) * self.angular_velocity + share * other.angular_velocity,
+            (1.0 - share) * self.variances + share * other.variances,
+            n,
+            self.begin_ns,
+            other.end_ns,
+        )
+
+
 class VelocityHistory:
     """Velocities in stamp order, joined with the angular velocities of another sensor.
 
@@ -73,6 +95,7 @@ class VelocityHistory:
         # Who has no odometry may publish zeros, and state how the robot may move as their noise.
         self._has_moved = False
         self._stands = False
+        self._rest: Rest | None = None
 
     def append(self, measured: MeasuredVelocity) -> bool:
         """Add velocities that are not earlier than any other; return whether they are in force.
@@ -89,6 +112,8 @@ class VelocityHistory:
             self._joined.repeat_last(first, measured.stamp_ns)
             self._joined.usual_s[first, 1] = self._periods.usual_s
             stand = [first] * self._stands
+            if self._stands:
+                self._note_rest(measured)
         elif isinstance(measured, VelocityEvent):
             first, one, usual_s = self._new_row(1), measured, self._took(measured)
             self._joined.write(first, one.stamp_ns, one.body_velocity, one.covariance, usual_s)
@@ -148,6 +173,23 @@ class VelocityHistory:
     def doubt_standing(self) -> None:
         """Begin again to judge whether the robot stands: something else contradicts it."""
         self._zero_since_ns, self._stands = None, False
+        self.forget_rest()
+
+    def _note_rest(self, measured: AngularVelocityEvent) -> None:
+        covariance = measured.covariance
+        variances = np.zeros(3) if covariance is None else np.diagonal(covariance)
+        now = Rest(measured.angular_velocity, variances, 1, measured.stamp_ns, measured.stamp_ns)
+        self._rest = now if self._rest is None else self._rest.joined(now)
+
+    def rest(self, stamp_ns: int) -> Rest | None:
+        """Return what a gyroscope says while the robot stands, at a stamp; None for nothing."""
+        if self._rest is not None and not self.stood_s(stamp_ns):
+            self.forget_rest()
+        return self._rest
+
+    def forget_rest(self) -> None:
+        """Begin again to take the mean of what a gyroscope says at rest."""
+        self._rest = None
 
     def stood_s(self, stamp_ns: int) -> float:
         """Return for how long the robot has stood at a stamp, seconds; 0 while it moves."""

@@ -168,6 +168,9 @@ class Past:
     def merge(self, rows: IntArray, copies: IntArray) -> None:
         """Take landmarks ``copies`` (m,) for ``rows`` (m,), as the filter has done."""
 
+    def sum_up(self) -> None:
+        """Let the present estimate stand for all that was seen until now."""
+
     def smooth(self) -> tuple[Step, int, History]:
         """Return the last step of smoothing, how many slips it confirms, and what it is of.
 
@@ -322,8 +325,7 @@ class Relinearisation(Past):
             return
         are_latest = numbers.min() >= self.history.summarised
         if not (are_latest and self._relinearise(ENTRY_ITERATIONS)):
-            self.history.summarise(self._known().least_nonlinear(self._axes)[0])
-            self._clear_counts()
+            self.sum_up()
 
     def add_calibration(self) -> None:
         """Note entries of the calibration that are estimated from now on."""
@@ -351,7 +353,12 @@ class Relinearisation(Past):
         """
         were_summed_up = np.min(copies) < len(self.history.summary.points)
         self.history.merge(rows, copies)
-        if were_summed_up and self.is_active:
+        if were_summed_up:
+            self.sum_up()
+
+    def sum_up(self) -> None:
+        """Let the present estimate stand for all that was seen until now."""
+        if self.is_active and self._is_dense:
             self.history.summarise(self._known().least_nonlinear(self._axes)[0])
             self._clear_counts()
 

@@ -248,6 +248,9 @@ class Hypotheses:
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
         stood_s, flat = velocities.stood_s(end_ns), velocities.flat()
+        rest = velocities.rest(end_ns)
+        if rest is not None and sum([state.learn_bias(rest) for state in self.states]):
+            velocities.forget_rest()
         for hypothesis in self._all:
             state = hypothesis.state
             state.observation_noise.stood_s = stood_s

@@ -19,6 +19,7 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.matrices import correlations_of
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.models.velocity_history import Rest
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
@@ -131,6 +132,22 @@ class State:
         if self.calibration.delay_error_ns:
             self.end_velocity = motion.at_end
         return motion.variances
+
+    def learn_bias(self, rest: Rest) -> bool:
+        """Take what a gyroscope says at rest for its bias; return whether that was used.
+
+        It is once it halves a variance: then what was seen before is not linearised again.
+        """
+        duration_s = to_s(rest.end_ns - rest.begin_ns)
+        if duration_s <= 0.0:
+            return False
+        densities = self.motion_noise.figures.densities[:3]
+        stated, is_stated = rest.variances / rest.taken, rest.variances > 0.0
+        variances = np.where(is_stated, stated, densities / duration_s)
+        is_used = self.gains.learn_bias(rest.angular_velocity, variances)
+        if is_used:
+            self.relinearisation.sum_up()
+        return is_used
 
     def slip(self, after: FloatArray, covariance: FloatArray) -> None:
         """Let the robot be at Â = ``after`` (4, 4), by a motion that odometry has not seen.
