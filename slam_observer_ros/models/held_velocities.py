@@ -65,9 +65,9 @@ def held(velocities: Velocities, start_ns: int, end_ns: int) -> HeldVelocities:
     bounds_ns[0], since_ns = start_ns, velocities.since_ns[first:last]
     rows: slice | IntArray = slice(first, last)
     dt_ns, before_s = np.diff(bounds_ns), to_s(bounds_ns[:-1, None] - since_ns)
-    gap_ns = np.maximum(bounds_ns[1:] - since_ns[:, 1] - velocities.timeout_ns, 0)
+    timed_out_ns = np.maximum(since_ns[:, 1] + velocities.timeout_ns, bounds_ns[:-1])
+    gap_ns = bounds_ns[1:] - np.minimum(timed_out_ns, bounds_ns[1:])
     if np.count_nonzero(gap_ns):  # seldom
-        gap_ns = np.minimum(gap_ns, dt_ns)
         piece = np.repeat(np.arange(last - first), 1 + ((gap_ns > 0) & (gap_ns < dt_ns)))
         is_gap = np.append(False, piece[1:] == piece[:-1]) | (gap_ns == dt_ns)[piece]
         rows, before_s = first + piece, before_s[piece]

@@ -171,6 +171,13 @@ def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(variance):
     np.testing.assert_allclose(estimator.pose, np.eye(4), atol=0.2)
 
 
+def test_before_the_first_velocity_there_is_a_gap_at_the_latest_stamp_as_well():
+    history, start_ns = VelocityHistory(SECOND), 2**63 - 2 * SECOND
+    history.append(VelocityEvent(start_ns, np.ones(6)))
+    found = history.held(start_ns - SECOND, start_ns + SECOND // 2)
+    np.testing.assert_allclose([found.dt_s, found.gap_s], [[0.0, 0.5], [1.0, 0.0]])
+
+
 @given(generators())
 def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
     settings = Settings(angular_velocity_noise=(0.01,) * 3, linear_velocity_noise=(0.02,) * 3)
