@@ -31,11 +31,6 @@ AFFECTED_BY = {
 """What a setting changes; ``gain_k`` is in the Lyapunov value of all."""
 
 
-def rows_and_gains(rows):
-    found = [pytest.param(row, by, id=f'{row.name}-{by}') for row in rows for by in AFFECTED_BY]
-    return pytest.mark.parametrize(('row', 'gains'), found)
-
-
 def other_value(row):
     """A value of a parameter that is not its default."""
     if row.choices:
@@ -44,11 +39,18 @@ def other_value(row):
     return tuple(quarter.tolist()) if quarter.ndim else float(quarter)
 
 
-def settings_and_other(row, gains, **more):
-    """Settings with the default of a parameter, and the same with another value."""
-    relinearised_often = {'relinearization_interval': 3, 'relinearization_angle': 0.0}
-    settings = Settings(gains=gains, reorder_window=0.0, **relinearised_often, **more)
-    return settings, replace(settings, **{row.name: other_value(row)})
+def relinearised_often(gains, **more):
+    return Settings(
+        gains=gains,
+        reorder_window=0.0,
+        relinearization_interval=3,
+        relinearization_angle=0.0,
+        **more,
+    )
+
+
+def changed_in(settings, rows):
+    return replace(settings, **{row.name: other_value(row) for row in rows})
 
 
 def events_of(settings, with_ids=True):
@@ -122,11 +124,13 @@ def test_every_live_setting_affects_some_filter():
     assert {row.name for row in OTHERS} == set().union(*AFFECTED_BY.values())
 
 
-@rows_and_gains(OTHERS)
+@pytest.mark.parametrize('gains', AFFECTED_BY)
+@pytest.mark.parametrize('row', OTHERS, ids=lambda row: row.name)
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_a_changed_setting_is_in_force_from_the_next_observation_on(row, gains, two_d_mode):
     """As in an estimator that was made with it, and that no observation has corrected so far."""
-    settings, other = settings_and_other(row, gains, two_d_mode=two_d_mode)
+    settings = relinearised_often(gains, two_d_mode=two_d_mode)
+    other = changed_in(settings, [row])
     before, after = split_before_observation(events_of(settings), 1)
     unchanged, changed, made = Estimator(settings), Estimator(settings), Estimator(other)
     add_all(before, unchanged, changed, made)
@@ -137,28 +141,27 @@ def test_a_changed_setting_is_in_force_from_the_next_observation_on(row, gains, 
     assert have_same_bits(unchanged, changed) == (row.name not in AFFECTED_BY[gains])
 
 
-@pytest.mark.parametrize('row', OTHERS, ids=lambda row: row.name)
-def test_a_changed_setting_is_in_force_where_points_have_no_ids(row):
-    settings, other = settings_and_other(row, 'riccati', confirmations=2)
+def test_changed_settings_are_in_force_where_points_have_no_ids():
+    settings = relinearised_often('riccati', confirmations=2)
     before, after = split_before_observation(events_of(settings, with_ids=False), 1)
-    changed, made = Estimator(settings), Estimator(other)
+    changed, made = Estimator(settings), Estimator(changed_in(settings, OTHERS))
     add_all(before, changed, made)
-    changed.change_settings(other)
+    changed.change_settings(changed_in(settings, OTHERS))
     agree_to_the_end(after, changed, made)
 
 
-@rows_and_gains(OTHERS)
+@pytest.mark.parametrize('gains', AFFECTED_BY)
 @pytest.mark.parametrize('mode', ['uncertain', 'fixed'])
-def test_a_changed_setting_is_in_force_in_a_loaded_map(row, gains, mode):
-    settings, other = settings_and_other(row, gains, localization_mode=mode)
+def test_changed_settings_are_in_force_in_a_loaded_map(gains, mode):
+    settings = relinearised_often(gains, localization_mode=mode)
     points = drive(settings, 1.0, landmarks=8, seen=5).world_points
     known = LandmarkMap(
         np.arange(8), points, np.tile(1e-4 * np.eye(3), (8, 1, 1)), np.ones(8, int)
     )
-    changed, made = Estimator(settings), Estimator(other)
+    changed, made = Estimator(settings), Estimator(changed_in(settings, OTHERS))
     for estimator in (changed, made):
         estimator.load_map(known, np.eye(4), 1e-2 * np.eye(6))
-    changed.change_settings(other)
+    changed.change_settings(changed_in(settings, OTHERS))
     agree_to_the_end(events_of(settings), changed, made)
 
 
@@ -166,18 +169,24 @@ def test_a_changed_setting_is_in_force_in_a_loaded_map(row, gains, mode):
     ('gains', 'with_ids'),
     [*((gains, True) for gains in AFFECTED_BY), ('riccati', False)],  # others need ids
 )
-@pytest.mark.parametrize('row', LIVE, ids=lambda row: row.name)
-def test_what_an_estimator_was_made_with_does_not_matter_after_a_change(row, gains, with_ids):
-    """Nor how often it has changed: in the middle of a run, whatever has been estimated."""
-    settings, other = settings_and_other(row, gains)
-    before, after = split_before_observation(events_of(settings, with_ids), 8)
-    changed, changed_twice = Estimator(settings), Estimator(other)
-    changed_twice.change_settings(settings)
-    add_all(before, changed, changed_twice)
-    np.testing.assert_equal(bits_of(changed), bits_of(changed_twice))
-    for estimator in (changed, changed_twice):
-        estimator.change_settings(other)
-    agree_to_the_end(after, changed, changed_twice)
+def test_what_an_estimator_was_made_with_does_not_matter_after_a_change(gains, with_ids):
+    """Nor how often it has changed: before each observation one setting has another value."""
+    settings = relinearised_often(gains)
+    others = [changed_in(settings, [row]) for row in LIVE]
+    changed, changed_often = Estimator(settings), Estimator(changed_in(settings, LIVE))
+    observations = 0
+    for event in events_of(settings, with_ids):
+        if isinstance(event, ObservationEvent):
+            now = others[observations % len(others)]
+            changed.change_settings(now)
+            for passing in (settings, *others, now):
+                changed_often.change_settings(passing)
+            observations += 1
+        add_all([event], changed, changed_often)
+        np.testing.assert_equal(bits_of(changed), bits_of(changed_often))
+        for estimator in (changed, changed_often):
+            estimator.change_settings(settings)
+    assert observations > len(others)
 
 
 def test_all_hypotheses_follow_a_change():
