@@ -26,7 +26,7 @@ def known(tmp_path):
     return str(path)
 
 
-def recording(path, kind=None, seconds=25.0):
+def recording(path, kind=None, seconds=20.0):
     events = drive(seconds=seconds)
     return str(write_events(path, list(MADE[kind].apply(events)) if kind else events))
 
@@ -99,7 +99,7 @@ def beside(events, later_ns, frame):
 def test_two_publishers_of_velocities_are_the_one_cause(tmp_path, capsys, later_ns, frame, sign):
     path = tmp_path / 'run.mcap'
     with RecordingWriter(path) as writer:
-        for event in beside(drive(seconds=30.0), later_ns, frame):
+        for event in beside(drive(), later_ns, frame):
             received_ns = (event.receive_ns or event.stamp_ns) + 10**9
             stamped = replace(event, stamp_ns=event.stamp_ns + 10**9)
             if isinstance(event, VelocityEvent):
@@ -120,7 +120,7 @@ def test_two_publishers_of_velocities_are_the_one_cause(tmp_path, capsys, later_
 def test_stamps_of_1970_are_named_and_no_clock_is_to_be_synchronised(tmp_path, capsys, topic):
     path, now_ns = tmp_path / 'run.mcap', 1_760_000_000 * 10**9
     with RecordingWriter(path) as writer:
-        for event in drive(seconds=20.0):
+        for event in drive():
             is_velocity = isinstance(event, VelocityEvent)
             received_ns = event.stamp_ns + now_ns
             stamped = replace(event, stamp_ns=received_ns)

@@ -30,13 +30,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built')
 @pytest.mark.parametrize(
     'options',
-    [
-        [],
-        ['--keep-pose'],
-        ['--reflectors', '--carried'],
-        ['--floor-codes', '--carried'],
-        ['--uwb'],
-    ],
+    [[], ['--reflectors', '--carried'], ['--floor-codes', '--keep-pose'], ['--uwb']],
     ids=' '.join,
 )
 def test_the_robot_is_localised_before_and_after_what_happens_half_way(

@@ -20,7 +20,7 @@ SETTINGS = Settings(
     range_noise=0.05,
     bearing_noise=0.01,
 )
-PERIOD_NS = 50_000_000
+PERIOD_NS = 100_000_000
 POSITIVE = np.diag([-1.0, -1.0, 1.0])
 
 MADE = {
@@ -49,17 +49,17 @@ def surveyed(seed=0):
     return LandmarkMap(np.arange(25), points, covariances, np.zeros(25, dtype=np.int64))
 
 
-def drive(seed=0, seconds=30.0, false=0.0):
+def drive(seed=0, seconds=20.0, false=0.0):
     """Events of a robot that drives an eight among landmarks, as noisy as stated."""
     rng, events, A = np.random.default_rng(seed), [], np.eye(4)
     landmarks = landmarks_of(rng)
     for step in range(round(seconds * 1e9 / PERIOD_NS)):
         stamp_ns, dt_s = (step + 1) * PERIOD_NS, PERIOD_NS * 1e-9
-        V = np.array([0.0, 0.0, 0.5 if step % 500 < 250 else -0.5, 0.6, 0.0, 0.0])
+        V = np.array([0.0, 0.0, 0.5 if step % 250 < 125 else -0.5, 0.6, 0.0, 0.0])
         noise = np.array([0.0, 0.0, 0.02, 0.02, 0.0, 0.0]) * rng.normal(size=6) / math.sqrt(dt_s)
         events.append(VelocityEvent(stamp_ns - PERIOD_NS, V + noise))
         A = A @ se3.exp(dt_s * V)
-        if step % 8:
+        if step % 4:
             continue
         points = se3.transform(se3.inverse(A), landmarks)
         ranges_m, bearings = np.linalg.norm(points, axis=1), np.arctan2(points[:, 1], points[:, 0])

@@ -140,10 +140,10 @@ def test_settings_are_changed_in_one_place():
     assert len(definitions) == 1
 
 
-@pytest.mark.parametrize('path', sources(), ids=lambda path: str(path.relative_to(CHECKOUT)))
-def test_words_are_those_of_the_field(path):
+def test_words_are_those_of_the_field():
     found = [
-        f'{number}: {line.strip()}'
+        f'{path.name}:{number}: {line.strip()}'
+        for path in sources()
         for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1)
         if VAGUE.search(line)
     ]

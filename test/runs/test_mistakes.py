@@ -94,7 +94,7 @@ def test_two_mistakes_are_both_named():
 
 
 def test_in_a_map_both_mirror_images_at_once_are_named():
-    right = drive(seconds=30.0)
+    right = drive()
     twice = list(MADE['points_mirrored'].apply(MADE['turning_negated'].apply(right)))
     assert named(twice) == []  # a robot that is right, in a mirrored world
     found_in_map = mistakes(SETTINGS, twice, surveyed())

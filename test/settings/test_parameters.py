@@ -58,9 +58,7 @@ def error_text(values, settings_class=Example):
     return text
 
 
-rows_of_all_tables = pytest.mark.parametrize(
-    'row', [pytest.param(row, id=row.name) for settings in TABLES for row in table(settings)]
-)
+ROWS = [row for settings_class in TABLES for row in table(settings_class)]
 
 
 def test_a_time_in_nanoseconds_is_refused_where_seconds_are_meant():
@@ -77,33 +75,33 @@ def test_each_field_is_a_row_of_the_table_and_the_other_way_round(settings_class
     assert from_parameters(settings_class, values) == settings_class()
 
 
-@rows_of_all_tables
-def test_each_default_is_in_its_own_range_and_of_its_own_type(row):
-    checked = row.check(row.default)
-    assert checked == row.default
-    assert type(checked) is type(row.default)
+def test_each_default_is_in_its_own_range_and_of_its_own_type():
+    for row in ROWS:
+        checked = row.check(row.default)
+        assert checked == row.default, row.name
+        assert type(checked) is type(row.default), row.name
 
 
-@rows_of_all_tables
-def test_each_row_is_described_by_one_line_without_a_full_stop(row):
-    assert row.description
-    assert '\n' not in row.description
-    assert row.description[0].isupper() or row.description.startswith('p')
-    assert not row.description.endswith('.')
-    assert row.name == row.name.lower()
+def test_each_row_is_described_by_one_line_without_a_full_stop():
+    for row in ROWS:
+        assert row.description, row.name
+        assert '\n' not in row.description
+        assert row.description[0].isupper() or row.description.startswith('p')
+        assert not row.description.endswith('.')
+        assert row.name == row.name.lower()
 
 
-@rows_of_all_tables
-def test_each_number_has_a_least_and_a_greatest_value_that_are_refused_when_exceeded(row):
-    if isinstance(row.default, bool | str):
-        return
-    assert math.isfinite(row.minimum)
-    assert math.isfinite(row.maximum)
-    for wrong in (2 * row.maximum + 1, row.minimum - 1):
-        number = int(wrong) if isinstance(row.default, int) else wrong
-        value = (number,) * len(row.default) if isinstance(row.default, tuple) else number
-        with pytest.raises(ParameterError, match=f"'{row.name}' takes a value ≥ .*, ≤ "):
-            row.check(value)
+def test_each_number_has_a_least_and_a_greatest_value_that_are_refused_when_exceeded():
+    for row in ROWS:
+        if isinstance(row.default, bool | str):
+            continue
+        assert math.isfinite(row.minimum), row.name
+        assert math.isfinite(row.maximum), row.name
+        for wrong in (2 * row.maximum + 1, row.minimum - 1):
+            number = int(wrong) if isinstance(row.default, int) else wrong
+            value = (number,) * len(row.default) if isinstance(row.default, tuple) else number
+            with pytest.raises(ParameterError, match=f"'{row.name}' takes a value ≥ .*, ≤ "):
+                row.check(value)
 
 
 def test_no_name_stands_for_two_things_in_one_node():
@@ -210,32 +208,25 @@ def test_angles_of_a_pose_in_degrees_are_refused(name):
         from_parameters(kind, {name: [0.0, 0.0, 0.0, 0.0, 0.0, 90.0]})
 
 
-@pytest.mark.parametrize('row', table(Settings), ids=lambda row: row.name)
-@settings(max_examples=10)
-@given(data=st.data())
-def test_what_is_in_range_is_taken(row, data):
-    value = data.draw(values_of(row))
-    made = from_parameters(Settings, {row.name: value})
-    assert type(getattr(made, row.name)) is type(row.default)
-
-
-@pytest.mark.parametrize('row', table(Settings), ids=lambda row: row.name)
 @settings(max_examples=10)
 @given(junk)
-def test_whatever_is_given_there_are_settings_or_a_parameter_error(row, value):
-    try:
-        made = from_parameters(Settings, {row.name: value})
-    except ParameterError as error:
-        assert row.name in str(error)
-        assert '\n' not in str(error)
-    else:
-        assert type(getattr(made, row.name)) is type(row.default)
+def test_whatever_is_given_there_are_settings_or_a_parameter_error(value):
+    for row in table(Settings):
+        try:
+            made = from_parameters(Settings, {row.name: value})
+        except ParameterError as error:
+            assert row.name in str(error)
+            assert '\n' not in str(error)
+        else:
+            assert type(getattr(made, row.name)) is type(row.default)
 
 
 @settings(max_examples=50)
 @given(st.fixed_dictionaries({}, optional={row.name: values_of(row) for row in table(Settings)}))
-def test_settings_that_are_accepted_make_an_estimator(values):
+def test_what_is_in_range_is_taken_and_makes_an_estimator(values):
     made = from_parameters(Settings, values)
+    for row in table(Settings):
+        assert type(getattr(made, row.name)) is type(row.default), row.name
     assert Estimator(made).settings == made
 
 
