@@ -168,13 +168,14 @@ MOST_S = 300.0
 def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
     """Return the events until the robot has driven for DRIVE_S, with points that have ids.
 
-    Or until a ``part`` of that.
+    Or until a ``part`` of that. A robot that reports no turn at all is not waited for to turn.
     """
     kept: list[Event] = []
     drive, first_ns = Drive(), None
     for event in events:
         first_ns = event.stamp_ns if first_ns is None else first_ns
-        is_enough = drive.driven_s > part * DRIVE_S and drive.turned_rad > part * TURNED_RAD
+        has_turned = drive.turned_rad > part * TURNED_RAD or not drive.turned_rad
+        is_enough = drive.driven_s > part * DRIVE_S and has_turned
         if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
             break
         drive.add(event)
@@ -342,6 +343,8 @@ def _named(
         settings = replace(settings, angular_velocity_noise=(UNKNOWN_TURN,) * 3)
     before = yield from _score(settings, events, AS_IT_IS, known)
     singles = CORRECTIONS if known is None else IN_MAP
+    if is_silent:
+        singles = tuple(each for each in singles if each.turn == 1.0)
     best = yield from _best(settings, events, before, singles, known)
     if best is before:
         # As with points in millimetres and in a camera's axes, where no single one helps.
@@ -388,8 +391,8 @@ def _best(
     }
     for each in corrections:
         if may_be.get(each.kind, True):
-            score = yield from _score(settings, early, each, known)
-            if not at_first.is_clearly_better(score):
+            score = yield from _score(settings, early, each, known, before)
+            if not score.is_hopeless and not at_first.is_clearly_better(score):
                 tried.append(score)
     tried.sort(key=lambda score: score.mean)
     best = before
@@ -397,7 +400,9 @@ def _best(
     if any(each.correction.changes for each in tried):
         as_sized = yield from _score(settings, events, AS_SIZED, known)
     for each in [score.correction for score in tried]:
-        score = yield from _score(settings, events, each, known)
+        score = yield from _score(settings, events, each, known, before)
+        if score.is_hopeless:
+            continue
         is_better = score.is_clearly_better(as_sized if each.changes else before)
         # In a frame of its own, where no map contradicts it, nothing is compared with the map.
         is_in_map = known is None or score.localised_share > max(0.0, before.localised_share - 0.1)
@@ -451,6 +456,7 @@ class _Score:
     scale: float  # of the wheels
     range_scale: float
     localised_share: float  # of the observations, in a loaded map
+    is_hopeless: bool = False  # it was given up before its end
 
     @property
     def mean(self) -> float:
@@ -481,6 +487,12 @@ class _Score:
         )
         return totals / np.maximum(counts, np.finfo(float).tiny), counts
 
+    def is_worse_so_far(self, other: _Score, stamp_ns: int) -> bool:
+        """Return whether points up to a stamp are so unlikely that going on is in vain."""
+        rival = other.until(stamp_ns)
+        count = min(self.likelihood.count, rival.likelihood.count)
+        return count * (rival.mean - self.mean) > SURE
+
     def until(self, stamp_ns: int) -> _Score:
         """Return how likely points were up to a stamp."""
         part = self.likelihood.select(self.likelihood.stamps_ns <= stamp_ns)
@@ -493,8 +505,13 @@ class _Score:
 
 
 def _score(
-    settings: Settings, events: Sequence[Event], correction: Correction, known: Maps | None
+    settings: Settings,
+    events: Sequence[Event],
+    correction: Correction,
+    known: Maps | None,
+    rival: _Score | None = None,
 ) -> Steps[_Score]:
+    """Run a filter that believes a correction; it is given up once it is worse than a rival."""
     settings = replace(settings, **correction.changes)
     k, scale = axes_of(settings.two_d_mode).point, correction.scale()
     reach = max(
@@ -510,26 +527,35 @@ def _score(
         attitudes.append(update.pose[:3, :3])
         localised.append(estimator.is_localised)
 
+    def so_far(is_hopeless: bool = False) -> _Score:
+        R = np.array(attitudes)
+        found_out = {each.name.partition('/')[0]: each.value for each in estimator.calibration}
+        return _Score(
+            correction,
+            recorder.likelihood,
+            k * math.log(scale),
+            recorder.log_outlier,
+            float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
+            found_out.get('linear_scale_x', 1.0),
+            found_out.get('range_scale', 1.0),
+            sum(localised) / max(len(localised), 1),
+            is_hopeless,
+        )
+
     estimator = Estimator(settings, on_update=note_update, judges_innovations=True)
     if known is not None:
         estimator.load_map(known)
     noise = ObservationNoise(settings) if correction.kind == 'tag_size' else None
+    checked_ns = events[0].stamp_ns
     for event in correction.apply(in_blocks(events), noise):
         if isinstance(event, VelocityBlock):
             estimator.add_velocities(event)
         else:
             estimator.add(event)
+            if rival is not None and event.stamp_ns > checked_ns + STRETCH_NS:
+                checked_ns = event.stamp_ns
+                if so_far().is_worse_so_far(rival, checked_ns):
+                    return so_far(is_hopeless=True)
         yield
     estimator.flush()
-    R = np.array(attitudes)
-    found_out = {each.name.partition('/')[0]: each.value for each in estimator.calibration}
-    return _Score(
-        correction,
-        recorder.likelihood,
-        k * math.log(scale),
-        recorder.log_outlier,
-        float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
-        found_out.get('linear_scale_x', 1.0),
-        found_out.get('range_scale', 1.0),
-        sum(localised) / max(len(localised), 1),
-    )
+    return so_far()
