@@ -34,7 +34,7 @@ from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.input_topic import InputTopic
 from slam_observer_ros.nodes.ros_node import is_installed, message_class
 from slam_observer_ros.recordings.event_builder import OdometryCheck
-from slam_observer_ros.runs.live_health import of_twist
+from slam_observer_ros.runs.health import of_twist
 from slam_observer_ros.settings.node_settings import (
     AUTO,
     message_types,

@@ -30,14 +30,15 @@ from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.input_topic import InputTopic
 from slam_observer_ros.nodes.ros_node import GuardedNode, LATCHED_QOS, ThrottledLog
 from slam_observer_ros.runs.health import (
+    deviations,
     estimator_values,
     InputNumbers,
+    localisation,
     of_all_learnt,
     of_fit,
     of_node,
     Progress,
 )
-from slam_observer_ros.runs.live_health import deviations, localisation
 from slam_observer_ros.runs.mistakes import Drive, Search
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 

@@ -34,7 +34,7 @@ from slam_observer_ros.nodes.ros_node import (
 )
 from slam_observer_ros.nodes.transforms import PoseBroadcaster
 from slam_observer_ros.recordings.frames import ALWAYS_NS, TransformBuffer
-from slam_observer_ros.runs.live_health import of_publishers
+from slam_observer_ros.runs.health import of_publishers
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 PATH_LENGTH = 2000

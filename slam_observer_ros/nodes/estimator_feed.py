@@ -30,7 +30,7 @@ from slam_observer_ros.recordings.event_builder import (
     with_receive_time,
 )
 from slam_observer_ros.recordings.frames import BaseFrame
-from slam_observer_ros.runs.live_health import ClockOffset
+from slam_observer_ros.runs.health import ClockOffset
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, ON_TF
 
 SOURCES: dict[type[Event], str] = {

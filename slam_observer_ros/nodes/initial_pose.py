@@ -37,7 +37,7 @@ from slam_observer_ros.mapping.landmark_map import MAX_NUMBER
 from slam_observer_ros.messages.poses import decode_pose_with_covariance_stamped, PoseMessage
 from slam_observer_ros.nodes.ros_node import RELIABLE_QOS, ThrottledLog
 from slam_observer_ros.nodes.transforms import TransformedOdometry
-from slam_observer_ros.runs.live_health import FUTURE_NS
+from slam_observer_ros.runs.health import FUTURE_NS
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.tracking.covariances import MAX_POSE_ERRORS, of_moved_pose

@@ -27,7 +27,7 @@ from slam_observer_ros.nodes.ros_node import (
     ThrottledLog,
     with_info,
 )
-from slam_observer_ros.runs.live_health import Backlog, of_publishers, of_types, overload
+from slam_observer_ros.runs.health import Backlog, of_publishers, of_types, overload
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.

@@ -8,6 +8,7 @@ import logging
 from typing import Any, TYPE_CHECKING
 
 from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.findings import in_brief, Level, worst_first
 from slam_observer_ros.common.stamps import is_due, NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import Update
@@ -19,11 +20,12 @@ from slam_observer_ros.messages.estimate_messages import (
     StateMessages,
     uncertain_pose,
 )
+from slam_observer_ros.messages.outgoing import OutgoingMessages
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import SelectedTopics
 from slam_observer_ros.recordings.trajectory import LandmarkTruth
-from slam_observer_ros.runs.health import diagnostics
+from slam_observer_ros.runs.health import estimator_values, of_now
 from slam_observer_ros.runs.metrics import TrajectoryErrors
 from slam_observer_ros.runs.result import Request
 from slam_observer_ros.settings.node_settings import InputSettings, ObserverNodeSettings
@@ -215,3 +217,25 @@ def estimate_writer(
         yield EstimateWriter(
             writer, map_frame, base_frame, ObserverNodeSettings().publish_rate, not has_parent
         )
+
+
+def diagnostics(
+    messages: OutgoingMessages, stamp_ns: int, estimator: Estimate, hardware_id: str
+) -> Any:
+    """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
+    findings = of_now(estimator)
+    problems = worst_first(findings, [])
+    values = estimator_values(estimator, estimator.dropped, findings)
+    status = messages.make(
+        'diagnostic_msgs/msg/DiagnosticStatus',
+        level=Level.WARNING if problems else Level.NOTE,
+        name='observer_node: estimate',
+        message=in_brief(problems) or 'running',
+        hardware_id=hardware_id,
+        values=[
+            messages.make('diagnostic_msgs/msg/KeyValue', key=key, value=value)
+            for key, value in values.items()
+        ],
+    )
+    header = messages.header(stamp_ns, '')
+    return messages.make('diagnostic_msgs/msg/DiagnosticArray', header=header, status=[status])

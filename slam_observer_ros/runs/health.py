@@ -1,19 +1,23 @@
 """The judge of health: what is wrong with an estimate, live and in a replay alike.
 
 What it finds are data (``common/findings.py``), which table, JSON, report, log and /diagnostics
-show. ``run_health.py`` judges what only a whole run shows.
+show. Nodes hand over what they count and measure; ``run_health.py`` judges what only a whole run
+shows.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from statistics import median_low
 from typing import Any
 
-from slam_observer_ros.common.findings import Finding, found, in_brief, Level, worst_first
-from slam_observer_ros.common.stamps import to_s
+import numpy as np
+
+from slam_observer_ros.common.findings import fault, Finding, found, Level
+from slam_observer_ros.common.stamps import is_of_1970, to_s
 from slam_observer_ros.common.types import is_automatic
 from slam_observer_ros.estimates import (
     Ambiguity,
@@ -27,7 +31,7 @@ from slam_observer_ros.estimates import (
 )
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.lie.matrices import MAX_DEVIATION
-from slam_observer_ros.messages.outgoing import OutgoingMessages
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 MAX_REJECTED = 0.1
 """Share of the points beyond which they are more than a sensor's outliers."""
@@ -93,6 +97,14 @@ MOUNTED = {
 """In words, by axis, how a sensor is mounted whose turn or shift is positive/negative."""
 
 
+def rule(holds: bool, kind: str, /, level: Level | None = None, **figures: Any) -> list[Finding]:
+    """Return the finding of a kind where it holds, else none; at a level of its own, if given."""
+    if not holds:
+        return []
+    finding = found(kind, **figures)
+    return [finding if level is None else replace(finding, level=level)]
+
+
 def estimator_values(
     estimator: Estimate, dropped: Counter[str], findings: Iterable[Finding]
 ) -> dict[str, str]:
@@ -112,44 +124,44 @@ def estimator_values(
     return values
 
 
-def of_velocity(estimator: Estimate) -> list[Finding]:
-    """Judge whether velocities still come."""
-    stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
-    return [found('stale_velocity')] if stale else []
+def of_now(estimator: Estimate) -> list[Finding]:
+    """Judge an estimate as it is now: whether velocities come, and what it has learnt."""
+    is_stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
+    return [
+        *rule(is_stale, 'stale_velocity'),
+        *of_estimate(estimator),
+        *of_map_without_ids(estimator, estimator.ambiguity),
+    ]
 
 
 def of_estimate(estimator: Estimate) -> list[Finding]:
     """Judge what is estimated of velocities and sensors, live and after a whole run alike."""
     calibration, factors = estimator.undisturbed
     of_odometry = [*of_calibration(calibration), *of_noise(factors)]
-    if of_odometry and estimator.has_rare_velocities:
-        of_odometry.append(found('rare_velocity', period_s=estimator.velocity_period_s))
-    half_points = of_half_points(estimator.anchor_biases, estimator.open_sides)
-    return [*of_odometry, *of_mounting(calibration), *half_points]
+    is_rare = bool(of_odometry) and estimator.has_rare_velocities
+    return [
+        *of_odometry,
+        *rule(is_rare, 'rare_velocity', period_s=estimator.velocity_period_s),
+        *of_mounting(calibration),
+        *of_half_points(estimator.anchor_biases, estimator.open_sides),
+    ]
 
 
 def of_all_learnt(estimator: Estimate) -> list[Finding]:
     """Judge the same, be it explained by a slip or the like: a mistake may explain both."""
     calibration = estimator.calibration
-    of_noise_learnt = of_noise(estimator.motion_factors)
-    return [*of_calibration(calibration), *of_mounting(calibration), *of_noise_learnt]
+    of_velocity = [*of_calibration(calibration), *of_mounting(calibration)]
+    return [*of_velocity, *of_noise(estimator.motion_factors)]
 
 
 def of_half_points(biases: Mapping[int, float], open_sides: Sequence[int]) -> list[Finding]:
     """Name landmarks whose ranges are off everywhere, and those that fit on two sides."""
     biased = [
-        found(
-            'anchor_biased',
-            anchor=anchor,
-            off_m=abs(off_m),
-            towards='short' if off_m < 0 else 'long',
-        )
-        for anchor, off_m in sorted(biases.items())
+        found('anchor_biased', anchor=i, off_m=abs(m), towards='short' if m < 0 else 'long')
+        for i, m in sorted(biases.items())
     ]
-    if not open_sides:
-        return biased
-    ids = ', '.join(str(landmark_id) for landmark_id in open_sides)
-    return [*biased, found('side_undecided', ids=ids)]
+    ids = ', '.join(map(str, open_sides))
+    return [*biased, *rule(bool(ids), 'side_undecided', ids=ids)]
 
 
 def of_map_without_ids(estimator: Estimate, ambiguity: Ambiguity | None) -> list[Finding]:
@@ -161,9 +173,8 @@ def of_map_without_ids(estimator: Estimate, ambiguity: Ambiguity | None) -> list
         findings.append(found('ambiguous_map', lasts_s=lasts_s, x=x, y=y, probability=probability))
     # After twice as many observations as one landmark takes.
     is_begun = estimator.counts['observation'] >= 2 * estimator.settings.confirmations
-    if is_begun and known < HARDLY_ANY * waiting:
-        findings.append(found('unconfirmed_map', waiting=waiting, known=known))
-    return findings
+    is_hardly_any = is_begun and known < HARDLY_ANY * waiting
+    return findings + rule(is_hardly_any, 'unconfirmed_map', waiting=waiting, known=known)
 
 
 def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
@@ -178,16 +189,15 @@ def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
     for part in parts:
         factor, unit = part.for_people
         times = abs(part.value - part.nominal) / part.stated
-        if times > IMPLAUSIBLE:
-            finding = found(
-                'implausible_calibration',
-                name=part.name,
-                value=factor * part.value,
-                times=times,
-                stated=factor * part.stated,
-                nominal=f'{factor * part.nominal:g} {unit}'.rstrip(),
-            )
-            findings.append(finding)
+        findings += rule(
+            times > IMPLAUSIBLE,
+            'implausible_calibration',
+            name=part.name,
+            value=factor * part.value,
+            times=times,
+            stated=factor * part.stated,
+            nominal=f'{factor * part.nominal:g} {unit}'.rstrip(),
+        )
     return findings
 
 
@@ -208,7 +218,8 @@ def of_mounting(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
         elif mounted in MOUNTED:
             factor, unit = part.for_people
             words, entry = MOUNTED[mounted]['xyz'.index(axis)]
-            finding = found(
+            findings += rule(
+                True,
                 'mounting',
                 sensor=sensor,
                 off=f'{abs(factor * off):.2g} ± {factor * part.deviation:.2g} {unit}',
@@ -216,7 +227,6 @@ def of_mounting(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
                 amount=off,
                 entry=entry,
             )
-            findings.append(finding)
     return findings
 
 
@@ -229,18 +239,10 @@ def of_ranges(power: RangePower | None, is_depth: bool) -> list[Finding]:
         return []
     # How far towards the other of the two.
     off = 1.0 - power.value if is_depth else power.value
-    if off < max(SHOWN, SURE * power.deviation):
-        return []
     looks, set_to = ('range, not depth', 'false') if is_depth else ('depth along the axis', 'true')
-    return [
-        found(
-            'depth_for_range',
-            looks=looks,
-            power=power.value,
-            deviation=power.deviation,
-            set_to=set_to,
-        )
-    ]
+    figures: dict[str, Any] = {'power': power.value, 'deviation': power.deviation}
+    is_other = off >= max(SHOWN, SURE * power.deviation)
+    return rule(is_other, 'depth_for_range', looks=looks, set_to=set_to, **figures)
 
 
 def of_noise(factors: Iterable[MotionFactor]) -> list[Finding]:
@@ -264,26 +266,28 @@ def of_fit(factor: float | None) -> list[Finding]:
     """
     if factor is None or factor < NOISELESS:
         return []
-    if factor > NOTABLY_WRONG:
-        level = Level.WARNING if factor > TOO_WRONG else Level.NOTE
-        return [replace(found('small_noise', factor=factor), level=level)]
-    return [found('large_noise', factor=1.0 / factor)] if factor < 1.0 / TOO_WRONG else []
+    level = Level.WARNING if factor > TOO_WRONG else Level.NOTE
+    return [
+        *rule(factor > NOTABLY_WRONG, 'small_noise', level, factor=factor),
+        *rule(factor < 1.0 / TOO_WRONG, 'large_noise', factor=1.0 / factor),
+    ]
 
 
 def of_rejections(counts: Counter[str], when: str = '') -> list[Finding]:
     """Judge whether more points or orientations were rejected than are outliers, or say little."""
-    points, orientations = (
-        point_share(counts, f'rejected_{what}') for what in ('landmark', 'orientation')
-    )
-    found_so = []
-    if points > MAX_REJECTED:
-        found_so.append(found('rejected_points', percent=100.0 * points, when=when))
-    if orientations > MAX_REJECTED_ORIENTATIONS:
-        found_so.append(found('rejected_orientations', percent=100.0 * orientations, when=when))
-    if point_share(counts, 'vague_point') > MAX_VAGUE:
-        count = counts['vague_point']
-        found_so.append(found('vague_point', count=count, limit_m=MAX_DEVIATION))
-    return found_so
+    names = ('rejected_landmark', 'rejected_orientation', 'vague_point')
+    points, turns, vague = (point_share(counts, name) for name in names)
+    count, limit_m = counts['vague_point'], MAX_DEVIATION
+    return [
+        *rule(points > MAX_REJECTED, 'rejected_points', percent=100.0 * points, when=when),
+        *rule(
+            turns > MAX_REJECTED_ORIENTATIONS,
+            'rejected_orientations',
+            percent=100.0 * turns,
+            when=when,
+        ),
+        *rule(vague > MAX_VAGUE, 'vague_point', count=count, limit_m=limit_m),
+    ]
 
 
 def of_left_out(counts: Counter[str], level: Level) -> list[Finding]:
@@ -291,29 +295,25 @@ def of_left_out(counts: Counter[str], level: Level) -> list[Finding]:
     left_out = {reason: counts[reason.value] for reason in LEFT_OUT if counts[reason.value]}
     of_wrong_ids = any(reason in left_out for reason in WRONG_IDS)
     most = most_frequent(counts, WRONG_IDS if of_wrong_ids else LEFT_OUT)
-    is_much = of_wrong_ids or 2 * sum(left_out.values()) > counts['observed_point']
-    if most is None or not is_much:
+    total = counts['observed_point']
+    if most is None or not (of_wrong_ids or 2 * sum(left_out.values()) > total):
         return []
     reasons = ', '.join(f'{count} {reason.words}' for reason, count in left_out.items())
-    finding = found(
-        'left_out_points', count=counts['observed_point'], reasons=reasons, remedy=most.remedy
-    )
-    return [replace(finding, level=level)]
+    remedy = most.remedy
+    return rule(True, 'left_out_points', level, count=total, reasons=reasons, remedy=remedy)
 
 
 def of_stamps(unstamped: Counter[str]) -> list[Finding]:
     """Report topics whose messages, so many of each, came without a stamp."""
-    if not unstamped:
-        return []
-    return [found('zero_stamps', topics=', '.join(unstamped), count=unstamped.total())]
+    count = unstamped.total()
+    return rule(count > 0, 'zero_stamps', topics=', '.join(unstamped), count=count)
 
 
-def of_map(counts: Counter[str], *, is_start_given: bool) -> Iterator[Finding]:
+def of_map(counts: Counter[str], *, is_start_given: bool) -> list[Finding]:
     """Judge whether a map that does not grow is the place's."""
     share = point_share(counts, 'unmapped_landmark')
-    if share > MAX_UNMAPPED:
-        start = ', and did the robot start where it was said to' if is_start_given else ''
-        yield found('unmapped_points', percent=100.0 * share, start=start)
+    start = ', and did the robot start where it was said to' if is_start_given else ''
+    return rule(share > MAX_UNMAPPED, 'unmapped_points', percent=100.0 * share, start=start)
 
 
 SILENT_S = 2.0
@@ -361,39 +361,40 @@ def of_node(
     estimator: Estimate, inputs: Sequence[InputNumbers], progress: Progress
 ) -> list[Finding]:
     """Judge where the robot is, what came, and what is estimated."""
-    findings = _of_place(estimator)
-    if progress.dropped and not progress.is_paused:
-        # What came while the node was paused or inactive was not to be used.
-        findings += [
-            found('unused_input', count=each.received, topic=each.topic)
-            for each in inputs
-            if each.name in USED_AS
-            and each.received >= MANY_UNUSED
-            and not estimator.counts[USED_AS[each.name]]
-        ]
-    findings += [
+    counts, total = estimator.counts, progress.dropped.total()
+    unused = [
+        found('unused_input', count=each.received, topic=each.topic)
+        for each in inputs
+        if each.name in USED_AS and each.received >= MANY_UNUSED and not counts[USED_AS[each.name]]
+    ]
+    silent = [
         found('silent_input', topic=each.topic)
         for each in inputs
         if not each.problem and each.silent_s > SILENT_S
     ]
-    if progress.is_paused:
-        findings.append(found('paused'))
-    elif total := progress.dropped.total():
+    dropped = rule(progress.is_paused, 'paused')
+    # What came while the node was paused or inactive was not to be used.
+    if total and not progress.is_paused:
         (reason, _), *others = progress.dropped.most_common()
         count = f'{total} message{"s" * (total != 1)}'
         reasons = f'mostly {reason}' if others else reason
-        findings.append(found('dropped_messages', count=count, reasons=reasons))
+        dropped = [found('dropped_messages', count=count, reasons=reasons)]
+    is_empty = not progress.has_seen and counts['observation'] >= MANY_EMPTY
+    has_points = progress.lately['observed_point'] >= MIN_POINTS
     said = [*(each.unread for each in inputs), *(each.doubt for each in inputs)]
-    findings += [finding for finding in said if finding is not None]
-    findings += of_stamps(progress.unstamped)
-    if not progress.has_seen and (observations := estimator.counts['observation']) >= MANY_EMPTY:
-        findings.append(found('empty_messages', count=observations))
-    findings += estimator.ids_at_two_places
-    findings += of_left_out(progress.counts, Level.WARNING)
-    if progress.lately['observed_point'] >= MIN_POINTS:
-        findings += of_rejections(progress.lately, 'seen lately ')
-    findings += of_velocity(estimator) + of_estimate(estimator)
-    return findings + of_map_without_ids(estimator, estimator.ambiguity)
+    return [
+        *_of_place(estimator),
+        *(unused if total and not progress.is_paused else []),
+        *silent,
+        *dropped,
+        *(finding for finding in said if finding is not None),
+        *of_stamps(progress.unstamped),
+        *rule(is_empty, 'empty_messages', count=counts['observation']),
+        *estimator.ids_at_two_places,
+        *of_left_out(progress.counts, Level.WARNING),
+        *(of_rejections(progress.lately, 'seen lately ') if has_points else []),
+        *of_now(estimator),
+    ]
 
 
 def _of_place(estimator: Estimate) -> list[Finding]:
@@ -405,24 +406,199 @@ def _of_place(estimator: Estimate) -> list[Finding]:
     return [*findings, problem] if problem and is_by_place else findings
 
 
-def diagnostics(
-    messages: OutgoingMessages, stamp_ns: int, estimator: Estimate, hardware_id: str
-) -> Any:
-    """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
-    findings = of_velocity(estimator) + of_estimate(estimator)
-    findings += of_map_without_ids(estimator, estimator.ambiguity)
-    problems = worst_first(findings, [])
-    values = estimator_values(estimator, estimator.dropped, findings)
-    status = messages.make(
-        'diagnostic_msgs/msg/DiagnosticStatus',
-        level=Level.WARNING if problems else Level.NOTE,
-        name='observer_node: estimate',
-        message=in_brief(problems) or 'running',
-        hardware_id=hardware_id,
-        values=[
-            messages.make('diagnostic_msgs/msg/KeyValue', key=key, value=value)
-            for key, value in values.items()
-        ],
-    )
-    header = messages.header(stamp_ns, '')
-    return messages.make('diagnostic_msgs/msg/DiagnosticArray', header=header, status=[status])
+def deviations(estimator: Estimate) -> tuple[float, float] | None:
+    """Return standard deviations of position, in its worst direction, m, and of heading, rad.
+
+    None if they are not known, and infinite if the covariance is not finite.
+    """
+    covariance = None if estimator.stamp_ns is None else estimator.pose_covariance
+    if covariance is None:
+        return None
+    if not np.isfinite(covariance).all():
+        return np.inf, np.inf
+    variances_m2 = np.linalg.eigvalsh(covariance[3:, 3:])
+    return math.sqrt(max(variances_m2[-1], 0.0)), math.sqrt(max(covariance[2, 2], 0.0))
+
+
+def localisation(
+    estimator: Estimate, limits: ObserverNodeSettings, share: float = 1.0
+) -> tuple[Level, str]:
+    """Judge, in words too, how well the pose is known.
+
+    The robot is lost from a share of the error level on.
+    """
+    if estimator.stamp_ns is None:
+        return Level.WARNING, 'no estimate yet'
+    if not estimator.is_localised:
+        return Level.ERROR, 'the pose in the loaded map is not known'
+    if estimator.is_contradicted:
+        return Level.ERROR, found('contradicted_pose').what
+    if estimator.map_name and estimator.ambiguity is not None:
+        return Level.ERROR, 'what is seen fits several places of the map'
+    if (known := deviations(estimator)) is None:
+        return Level.NOTE, 'localised; the gains know no standard deviation'
+    worst, reasons = Level.NOTE, []
+    for name, value, unit, (warn, lost) in (
+        ('position', known[0], 'm', limits.position_limits),
+        ('heading', known[1], 'rad', limits.heading_limits),
+    ):
+        error = share * lost
+        if value > min(warn, error):
+            worst = max(worst, Level.ERROR if value > error else Level.WARNING)
+            reasons.append(f'{name} uncertain: σ = {value:.2f} {unit}')
+    return worst, '; '.join(reasons) or 'localised'
+
+
+def of_publishers(topic: str, publishers: Sequence[Any]) -> Finding | None:
+    """Report who publishes on a topic, by rclpy's TopicEndpointInfo, if more than one does."""
+    if len(publishers) < 2:
+        return None
+    names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
+    return found('several_publishers', count=len(names), names=', '.join(names), topic=topic)
+
+
+def of_types(topic: str, heard: str, others: str) -> Finding:
+    """Report that types beside the one that is heard are published on a topic."""
+    return found('several_types', topic=topic, heard=heard, others=others)
+
+
+def of_twist(topic: str, problem: str) -> Finding:
+    """Report that an odometry's twist is not how its poses move; without problem, that it is 0."""
+    return found('wrong_twist' if problem else 'zero_twist', topic=topic, problem=problem)
+
+
+BEHIND_S = 0.3
+"""Messages that wait for less, as while a map is loaded, are no matter."""
+
+LASTING_S = 2.0
+"""How long messages have to wait for more than that before it is reported."""
+
+
+class Backlog:
+    """Distinguishes a program that can't keep up with a topic from one busy for a moment.
+
+    ``wait_s`` is how long the last message has waited, seconds.
+    """
+
+    def __init__(self) -> None:
+        self.wait_s = 0.0
+        self._last_s = 0.0
+        self._behind_since_s: float | None = None
+
+    def add(self, wait_s: float, now_s: float) -> None:
+        """Take how long a message that is read now, at a steady time, has waited, seconds.
+
+        That is less than zero if the clock was set meanwhile.
+        """
+        is_long_ago = now_s - self._last_s > LASTING_S
+        self.wait_s, self._last_s = max(wait_s, 0.0), now_s
+        if self.wait_s <= BEHIND_S:
+            self._behind_since_s = None
+        elif self._behind_since_s is None or is_long_ago:
+            self._behind_since_s = now_s
+
+    def problem(self, topic: str, now_s: float) -> str:
+        """Report that messages have waited for long and still do; empty if not."""
+        since_s, last_s = self._behind_since_s, self._last_s
+        if since_s is None or last_s - since_s < LASTING_S or now_s - last_s > LASTING_S:
+            return ''
+        return fault('slow_node', topic=topic, wait_s=self.wait_s)
+
+
+MIN_PERIOD_S = 2.0
+"""Time over which it is seen how much is dropped: who was busy for a moment does keep up."""
+
+MANY_SHED = 0.1
+"""Share of the messages from which on it is reported."""
+
+
+def overload(topic: str, read: int, shed: int, period_s: float) -> str:
+    """Report that many messages of a period were dropped, and how many would not be; else ''."""
+    if period_s < MIN_PERIOD_S or shed <= MANY_SHED * read:
+        return ''
+    rate_hz, used_hz = read / period_s, (read - shed) / period_s
+    return fault('overload', topic=topic, rate_hz=rate_hz, used_hz=used_hz)
+
+
+SAMPLES = 11
+"""Messages whose median offset is looked at: five stragglers in a row change nothing."""
+
+FUTURE_NS = 50_000_000
+"""Stamps that are further ahead of their reception can only be of another clock, nanoseconds."""
+
+
+class ClockOffset:
+    """Offset of the stamps of one publisher, by which they may be of another clock.
+
+    Behind this machine's by more than ``limit_ns``, or ahead of it by ``FUTURE_NS``: a message can
+    be late, but not early.
+
+    Attributes
+    ----------
+    offset_ns : int or None
+        Stamp minus time of reception, median of the last messages; None until known.
+    correction_ns : int
+        What must be added to the stamps to have them in this machine's time; it changes only
+        when the stamps so corrected leave the limit, so that their order is kept.
+
+    """
+
+    def __init__(self, limit_ns: int) -> None:
+        self._limit_ns = self._ahead_ns = limit_ns
+        self._recent: deque[int] = deque(maxlen=SAMPLES)
+        self.offset_ns: int | None = None
+        self.correction_ns = 0
+        self._counts_from_start = False
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the stamps are from another clock."""
+        return self.offset_ns is not None and not self._is_near(self.offset_ns)
+
+    def __str__(self) -> str:
+        """Say how far off the stamps are."""
+        offset_ns = self.offset_ns or 0
+        side = 'ahead of' if offset_ns > 0 else 'behind'
+        return f"{to_s(abs(offset_ns)):.3f} s {side} this machine's clock"
+
+    def problem(self, topic: str, is_simulated: bool) -> str:
+        """Report how far off the stamps on a topic are, or one of late; empty if they are right.
+
+        ``is_simulated``: this machine's clock is /clock.
+        """
+        if self.is_off and self._counts_from_start:
+            simulation = 'whose /clock is another' if is_simulated else 'set use_sim_time'
+            return fault('stamps_of_1970', topic=topic, simulation=simulation)
+        advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
+        if is_simulated:
+            advice = 'see whether their publisher uses /clock, and this machine keeps up with it'
+        if self.is_off:
+            late = ':'
+            if (self.offset_ns or 0) < 0:
+                late = ', or what publishes them is that late: then make it faster; otherwise'
+            return fault('stamps_off', topic=topic, off=self, late=late, advice=advice)
+        ahead_ns = max(self._recent, default=0)
+        if ahead_ns > self._ahead_ns:
+            return fault('stamp_ahead', topic=topic, ahead_s=to_s(ahead_ns), advice=advice)
+        return ''
+
+    def add(self, stamp_ns: int, receive_ns: int, is_simulated: bool = False) -> None:
+        """Take the stamp and the time of reception of a message; by /clock if ``is_simulated``."""
+        # /clock stands still between two of its messages.
+        self._ahead_ns = self._limit_ns if is_simulated else min(FUTURE_NS, self._limit_ns)
+        self._recent.append(stamp_ns - receive_ns)
+        self._counts_from_start = is_of_1970(stamp_ns) and not is_of_1970(receive_ns)
+        if len(self._recent) < SAMPLES:
+            return
+        self.offset_ns = median_low(self._recent)
+        if not self._is_near(self.offset_ns + self.correction_ns):
+            self.correction_ns = -self.offset_ns if self.is_off else 0
+
+    def _is_near(self, offset_ns: int) -> bool:
+        return -self._limit_ns <= offset_ns <= self._ahead_ns
+
+    def clear(self) -> None:
+        """Forget all offsets, as after a jump of this machine's clock."""
+        self._recent.clear()
+        self.offset_ns = None
+        self.correction_ns = 0

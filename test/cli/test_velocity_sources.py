@@ -24,7 +24,7 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.models.motion_noise import MotionNoise
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.recordings.event_builder import PoseDifferences
-from slam_observer_ros.runs.live_health import ClockOffset, SAMPLES
+from slam_observer_ros.runs.health import ClockOffset, SAMPLES
 from slam_observer_ros.settings.estimator_settings import Settings
 
 SECOND = 1_000_000_000
