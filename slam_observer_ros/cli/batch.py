@@ -31,7 +31,7 @@ from slam_observer_ros.cli.options import (
     add_settings_options,
     check_directory,
     named,
-    named_path,
+    options,
     parse_value,
     read_given,
     read_request,
@@ -133,56 +133,37 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'Replay every recording with every setting. What is done is kept: the same command goes '
         'on where it was stopped, and does no run twice.'
     )
-    parser.add_argument(
-        'recordings',
-        nargs='+',
-        type=named,
-        metavar='RECORDING',
-        help="recordings, or patterns such as 'recordings/**/*.mcap'",
+    options(
+        parser,
+        """
+        recordings RECORDING: recordings, or patterns such as 'recordings/**/*.mcap'
+        --grid NAME=VALUE,VALUE…: values of a parameter; of several, every combination is run
+        """,
+        recordings={'nargs': '+', 'type': named},
+        grid={'action': 'append', 'default': []},
     )
-    parser.add_argument(
-        '--grid',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE,VALUE…',
-        help='values of a parameter; of several, every combination is run',
+    options(
+        parser.add_argument_group('outputs'),
+        """
+        --out DIR: where runs.jsonl, a line for each run, and index.html are written
+        --reports: write a report of each run
+        --trajectories: write the trajectory of each run, as TUM
+        --score: which figure the best has least of
+        --json: print one JSON object
+        """,
+        out={'required': True},
+        score={'choices': SCORES, 'default': SCORES[0]},
     )
-    outputs = parser.add_argument_group('outputs')
-    outputs.add_argument(
-        '--out',
-        type=named_path,
-        required=True,
-        metavar='DIR',
-        help='where runs.jsonl, a line for each run, and index.html are written',
-    )
-    outputs.add_argument('--reports', action='store_true', help='write a report of each run')
-    outputs.add_argument(
-        '--trajectories', action='store_true', help='write the trajectory of each run, as TUM'
-    )
-    outputs.add_argument(
-        '--score', choices=SCORES, default=SCORES[0], help='which figure the best has least of'
-    )
-    outputs.add_argument('--json', action='store_true', help='print one JSON object')
-    where = parser.add_argument_group('where it runs')
-    where.add_argument(
-        '--workers',
-        type=_worker_count,
-        default=len(os.sched_getaffinity(0)),
-        metavar='N',
-        help='processes of this machine (default: one for each of its cores)',
-    )
-    where.add_argument(
-        '--scheduler',
-        metavar='tcp://HOST:PORT',
-        help='run on the workers of this Dask scheduler, which find recordings and --out at the '
-        'same paths',
-    )
-    where.add_argument(
-        '--shard',
-        type=shard_of,
-        default=(1, 1),
-        metavar='i/N',
-        help='do only the i-th of N parts, as an array job does',
+    options(
+        parser.add_argument_group('where it runs'),
+        """
+        --workers N: processes of this machine (default: one for each of its cores)
+        --scheduler tcp://HOST:PORT: run on the workers of this Dask scheduler, which find
+            recordings and --out at the same paths
+        --shard i/N: do only the i-th of N parts, as an array job does
+        """,
+        workers={'type': _worker_count, 'default': len(os.sched_getaffinity(0))},
+        shard={'type': shard_of, 'default': (1, 1)},
     )
     add_run_options(parser)
     add_settings_options(parser, InputSettings)

@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from slam_observer_ros.cli.console import print_columns, print_json, print_table, progress_bar
 from slam_observer_ros.cli.options import (
-    add_force_option,
     add_input_options,
     add_settings_options,
     check_inputs_are_kept,
     check_outputs,
+    FORCE,
     Given,
-    named_path,
+    options,
     read_given,
     read_request,
 )
@@ -70,49 +70,39 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'on what was held out: the last third, or other recordings. If it does not, no file is '
         'written, and the exit code is 4.'
     )
-    parser.add_argument(
-        'recordings',
-        nargs='+',
-        type=named_path,
-        metavar='RECORDING',
-        help='a drive; for --only noise it may be several, driven for anything else',
+    options(
+        parser,
+        """
+        recordings RECORDING: a drive; for --only noise it may be several, driven for anything else
+        --map SURVEY.yaml: map file of surveyed landmarks
+        """,
+        recordings={'nargs': '+'},
+        map={'dest': 'survey'},
     )
-    parser.add_argument(
-        '--map',
-        dest='survey',
-        type=named_path,
-        metavar='SURVEY.yaml',
-        help='map file of surveyed landmarks',
+    options(
+        parser.add_mutually_exclusive_group(),
+        """
+        --only: find the noise of points and velocities, and leave all else as it is stated
+        --keep-noise: leave the noise of points as it is stated, which takes a third of the time
+        """,
+        only={'choices': ('noise',)},
     )
-    searched = parser.add_mutually_exclusive_group()
-    searched.add_argument(
-        '--only',
-        choices=('noise',),
-        help='find the noise of points and velocities, and leave all else as it is stated',
+    options(
+        parser,
+        """
+        --hold-out RECORDING: hold this one out, and take all of the others; may be given several
+            times
+        """,
+        hold_out={'action': 'append', 'default': []},
     )
-    searched.add_argument(
-        '--keep-noise',
-        action='store_true',
-        help='leave the noise of points as it is stated, which takes a third of the time',
+    options(
+        parser.add_argument_group('outputs'),
+        """
+        -o --out FILE: parameter file to write if it is an improvement
+        --json: print one JSON object
+        """,
     )
-    parser.add_argument(
-        '--hold-out',
-        action='append',
-        default=[],
-        type=named_path,
-        metavar='RECORDING',
-        help='hold this one out, and take all of the others; may be given several times',
-    )
-    outputs = parser.add_argument_group('outputs')
-    outputs.add_argument(
-        '-o',
-        '--out',
-        type=named_path,
-        metavar='FILE',
-        help='parameter file to write if it is an improvement',
-    )
-    outputs.add_argument('--json', action='store_true', help='print one JSON object')
-    add_force_option(parser)
+    options(parser, FORCE)
     add_input_options(parser)
     add_settings_options(parser, InputSettings)
     parser.set_defaults(smooth=False, load_map=None, run=run)

@@ -11,8 +11,7 @@ import json
 import math
 import sys
 
-from slam_observer_ros.cli.console import completed_by
-from slam_observer_ros.cli.options import config_files, find_config, named, shipped_names
+from slam_observer_ros.cli.options import config_files, find_config, options, shipped_names
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.files import not_special
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -92,25 +91,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         'Without a name, list the parameter files that come with the package; with one, print it.'
     )
-    name = parser.add_argument(
-        'name',
-        nargs='?',
-        type=named,
-        metavar='NAME',
-        help='a parameter file, or the name of one of those',
+    options(
+        parser,
+        'name NAME: a parameter file, or the name of one of those',
+        name={'nargs': '?', 'completer': config_files},
     )
-    completed_by(name, config_files)
-    printed = parser.add_mutually_exclusive_group()
-    printed.add_argument(
-        '--dump',
-        action='store_true',
-        help='print all parameters of observer_node, at the values of NAME or their defaults, and '
-        'what each is',
-    )
-    printed.add_argument(
-        '--schema',
-        action='store_true',
-        help='print a JSON schema of parameter files, with which editors complete and check them',
+    options(
+        parser.add_mutually_exclusive_group(),
+        """
+        --dump: print all parameters of observer_node, at the values of NAME or their defaults, and
+            what each is
+        --schema: print a JSON schema of parameter files, with which editors complete and check
+            them
+        """,
     )
     parser.set_defaults(run=run)
 

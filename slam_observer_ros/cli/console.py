@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Siz
 from contextlib import contextmanager
 import logging
 import sys
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from slam_observer_ros.common.errors import json_text
 from slam_observer_ros.common.process import leaving_at_once
@@ -147,9 +147,3 @@ def complete(parser: argparse.ArgumentParser) -> None:
     import argcomplete  # which --help has no use for
 
     argcomplete.autocomplete(parser)
-
-
-def completed_by(action: argparse.Action, completer: Callable[..., Sequence[str]]) -> None:
-    """Have an option's value completed by what a function returns, as argcomplete takes it."""
-    described: Any = action
-    described.completer = completer

@@ -10,12 +10,10 @@ import numpy as np
 
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.options import (
-    add_force_option,
     check_inputs_are_kept,
     check_outputs,
-    named,
-    named_path,
-    recording_path,
+    FORCE,
+    options,
 )
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.files import unfinished_file
@@ -58,22 +56,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     starry_night = data_sets.add_parser(
         'starry-night', help='stereo camera and IMU moved by hand: dataset3.mat'
     )
-    starry_night.add_argument('file', type=named_path, metavar='FILE', help='dataset3.mat')
+    options(starry_night, 'file FILE: dataset3.mat')
     starry_night.set_defaults(load=lambda args: load_starry_night(args.file))
     mrclam = data_sets.add_parser(
         'mrclam', help='wheeled robots among coded landmarks: MRCLAM_Dataset1 to 9'
     )
-    mrclam.add_argument(
-        'folder', type=named_path, metavar='FOLDER', help='such as MRCLAM_Dataset6'
-    )
-    mrclam.add_argument(
-        '--robot', type=int, required=True, metavar='N', help='which robot, from 1 to 5'
-    )
-    mrclam.add_argument(
-        '--measure',
-        choices=tuple(MEASURES),
-        default='point',
-        help='leave only directions or distances of the landmarks (default point: both)',
+    options(
+        mrclam,
+        """
+        folder FOLDER: such as MRCLAM_Dataset6
+        --robot N: which robot, from 1 to 5
+        --measure: leave only directions or distances of the landmarks (default point: both)
+        """,
+        robot={'required': True},
+        measure={'choices': tuple(MEASURES), 'default': 'point'},
     )
     mrclam.set_defaults(load=lambda args: load_mrclam(args.folder, args.robot, args.measure))
     plaza = data_sets.add_parser(
@@ -84,48 +80,41 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'sender, anchor, range (m); and, if they are there, plazaN_gt.csv, true poses: t, x, y, '
         'yaw, and plazaN_tl.csv, radios: anchor, x, y. OUT.yaml is made, too: the map of these.',
     )
-    plaza.add_argument('folder', type=named_path, metavar='FOLDER', help='of these files')
-    plaza.add_argument('--run', type=int, required=True, metavar='N', dest='number', help='1 or 2')
+    options(
+        plaza,
+        """
+        folder FOLDER: of these files
+        --run N: 1 or 2
+        """,
+        run={'required': True, 'dest': 'number'},
+    )
     plaza.set_defaults(load=lambda args: load_plaza(args.folder, args.number))
     graph = data_sets.add_parser(
         'graph', help='poses and points in the plane, in the text formats of iSAM and g2o'
     )
-    graph.add_argument('file', type=named_path, metavar='FILE', help='such as victoria_park.txt')
-    graph.add_argument(
-        '--truth',
-        type=named_path,
-        metavar='FILE',
-        help='the same graph with true, or the best, values',
+    options(
+        graph,
+        """
+        file FILE: such as victoria_park.txt
+        --truth FILE: the same graph with true, or the best, values
+        """,
     )
     graph.set_defaults(load=lambda args: load_graph(args.file, args.truth))
-    for data_set, write_beside in (
-        (starry_night, None),
-        (mrclam, None),
-        (plaza, _write_survey),
-        (graph, _write_parameters),
-    ):
-        data_set.set_defaults(run=_run, write_beside=write_beside)
-        data_set.add_argument(
-            'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
-        )
-        add_force_option(data_set)
-
+    for data_set in (starry_night, mrclam, plaza, graph):
+        beside = {plaza: _write_survey, graph: _write_parameters}.get(data_set)
+        data_set.set_defaults(run=_run, write_beside=beside)
+        options(data_set, f'output OUT.mcap: recording to make\n{FORCE}')
     tum = data_sets.add_parser('tum', help='poses of a topic of a recording, as evo reads them')
-    tum.add_argument('file', type=named_path, metavar='RECORDING', help='as replay reads it')
-    tum.add_argument('output', type=named_path, metavar='OUT.tum', help='TUM file to make')
-    tum.add_argument(
-        '--topic',
-        type=named,
-        metavar='TOPIC',
-        help='poses or odometry; by default the true poses, as replay finds them',
+    options(
+        tum,
+        f"""
+        file RECORDING: as replay reads it
+        output OUT.tum: TUM file to make
+        --topic TOPIC: poses or odometry; by default the true poses, as replay finds them
+        --base-frame FRAME: move poses that are of another frame to this one, by /tf_static
+        {FORCE}
+        """,
     )
-    tum.add_argument(
-        '--base-frame',
-        type=named,
-        metavar='FRAME',
-        help='move poses that are of another frame to this one, by /tf_static',
-    )
-    add_force_option(tum)
     tum.set_defaults(run=_run_tum)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from slam_observer_ros.cli.console import print_json, print_table
-from slam_observer_ros.cli.options import find_config, named_path
+from slam_observer_ros.cli.options import find_config, options
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import explained, Finding
@@ -73,19 +73,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'why, and which mistake of the set-up (signs, units, frames) explains it better, '
         'or whether two publish velocities on one topic.'
     )
-    parser.add_argument(
-        'recording', nargs='?', type=named_path, metavar='RECORDING', help='as replay takes it'
+    options(
+        parser,
+        """
+        recording RECORDING: as replay takes it
+        --seconds S: how long to listen (default 3)
+        --load-map MAP: map that the robot was in, by which mistakes of the set-up are judged
+        --json: print one JSON object
+        """,
+        recording={'nargs': '?'},
+        seconds={'default': 3.0},
     )
-    parser.add_argument(
-        '--seconds', type=float, default=3.0, metavar='S', help='how long to listen (default 3)'
-    )
-    parser.add_argument(
-        '--load-map',
-        type=named_path,
-        metavar='MAP',
-        help='map that the robot was in, by which mistakes of the set-up are judged',
-    )
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.set_defaults(run=run)
 
 

@@ -11,11 +11,10 @@ import numpy as np
 
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.options import (
-    add_force_option,
     check_inputs_are_kept,
     check_outputs,
-    named,
-    named_path,
+    FORCE,
+    options,
 )
 from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.map_check import look_around, place_for_another, symmetries
@@ -57,44 +56,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'and orientation_sigma; TagSLAM: the YAML file of bodies, or its output; the tag_bundles '
         'of apriltag_ros for ROS 1: poses in the frame of the bundle.',
     )
-    convert.add_argument(
-        'file',
-        type=named_path,
-        metavar='FILE',
-        help='.csv, .tsv, .txt, .yaml, .json, or .imk and .lmk of a navigation scanner',
+    options(
+        convert,
+        f"""
+        file FILE: .csv, .tsv, .txt, .yaml, .json, or .imk and .lmk of a navigation scanner
+        output OUT.yaml: map file to make
+        --frame FRAME: frame of the positions (default map)
+        --sigma M: standard deviation of coordinates that have none, metres (default 0.02)
+        --orientation-sigma RAD: standard deviation of a tag's orientation about each axis, radians
+            (default 0.03: put up by eye)
+        --tag-axes: x, y and z of a tag as your detector reports them, seen from before the tag
+            (default right-up-out, as apriltag_ros's); none for positions only
+        --unit: of coordinates and their sigmas, where the file does not say (default m)
+        {FORCE}
+        """,
+        frame={'default': 'map'},
+        sigma={'type': _deviation, 'default': 0.02},
+        orientation_sigma={'type': _deviation, 'default': 0.03},
+        tag_axes={'choices': tuple(TAG_AXES), 'default': 'right-up-out'},
+        unit={'choices': LENGTHS},
     )
-    convert.add_argument('output', type=named_path, metavar='OUT.yaml', help='map file to make')
-    convert.add_argument(
-        '--frame', type=named, default='map', help='frame of the positions (default map)'
-    )
-    convert.add_argument(
-        '--sigma',
-        type=_deviation,
-        default=0.02,
-        metavar='M',
-        help='standard deviation of coordinates that have none, metres (default 0.02)',
-    )
-    convert.add_argument(
-        '--orientation-sigma',
-        type=_deviation,
-        default=0.03,
-        metavar='RAD',
-        help="standard deviation of a tag's orientation about each axis, radians (default 0.03: "
-        'put up by eye)',
-    )
-    convert.add_argument(
-        '--tag-axes',
-        choices=tuple(TAG_AXES),
-        default='right-up-out',
-        help='x, y and z of a tag as your detector reports them, seen from before the tag '
-        "(default right-up-out, as apriltag_ros's); none for positions only",
-    )
-    convert.add_argument(
-        '--unit',
-        choices=LENGTHS,
-        help='of coordinates and their sigmas, where the file does not say (default m)',
-    )
-    add_force_option(convert)
     convert.set_defaults(run=_convert)
     check = actions.add_parser(
         'check',
@@ -102,33 +83,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         description='Looks around from places all over a map, and says where the landmarks in '
         'view, without ids, say where the robot is.',
     )
-    check.add_argument('file', type=named_path, metavar='MAP.yaml', help='map file')
-    check.add_argument(
-        '--view',
-        type=_metres,
-        default=15.0,
-        metavar='M',
-        help='how far the sensor sees, metres (default 15)',
+    options(
+        check,
+        f"""
+        file MAP.yaml: map file
+        --view M: how far the sensor sees, metres (default 15)
+        --fov DEG: its field of view, degrees (default 360)
+        --sigma M: standard deviation of each coordinate that it measures, metres (default 0.02)
+        --space: a robot that also rolls and pitches, not two_d_mode
+        --plot OUT.png: picture of it to write
+        {FORCE}
+        """,
+        view={'type': _metres, 'default': 15.0},
+        fov={'type': _degrees, 'default': 360.0},
+        sigma={'type': _metres, 'default': 0.02},
     )
-    check.add_argument(
-        '--fov',
-        type=_degrees,
-        default=360.0,
-        metavar='DEG',
-        help='its field of view, degrees (default 360)',
-    )
-    check.add_argument(
-        '--sigma',
-        type=_metres,
-        default=0.02,
-        metavar='M',
-        help='standard deviation of each coordinate that it measures, metres (default 0.02)',
-    )
-    check.add_argument(
-        '--space', action='store_true', help='a robot that also rolls and pitches, not two_d_mode'
-    )
-    check.add_argument('--plot', type=named_path, metavar='OUT.png', help='picture of it to write')
-    add_force_option(check)
     check.set_defaults(run=_check)
 
 

@@ -10,14 +10,15 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
+from inspect import cleandoc
 import json
 import logging
 import os
 from pathlib import Path
+import re
 from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
 
-from slam_observer_ros.cli.console import completed_by
 from slam_observer_ros.common.errors import ParameterError, UsageError
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import (
@@ -53,27 +54,59 @@ _ROS_NAMES = ('use_sim_time', 'qos_overrides.', 'start_type_description_service'
 """Parameters that every ROS node has; a name that ends with a dot stands for all below it."""
 
 
+FORCE = '--force: replace files that exist already'
+
+
+def options(group: Any, text: str, **more: Mapping[str, Any]) -> None:
+    """Add options to a parser or a group of it, each by a line of ``text`` as help shows it.
+
+    A line has names, what the option takes, a colon and the help; it may go on in lines that are
+    indented. By what an option takes its value is a name, a path, a number or a text. ``more`` are
+    other arguments of ``add_argument`` for some options, and a ``completer`` of their values.
+    """
+    types: dict[str, Any] = {'TOPIC': named, 'FRAME': named, 'NAME': named}
+    types |= dict.fromkeys(
+        ('FILE', 'DIR', 'FOLDER', 'RECORDING', 'MAP', 'SURVEY', 'OUT'), named_path
+    )
+    types |= {'ID': int, 'N': int, 'S': float, 'OUT.mcap': recording_path}
+    for line in re.split(r'\n(?=\S)', cleandoc(text)):
+        words, _, help_text = line.partition(': ')
+        *names, last = words.split()
+        given: dict[str, Any] = {'metavar': last, 'type': types.get(last)}
+        if not names or last.startswith('-'):
+            names.append(last)
+            given = {}
+        own = dict(more.get(names[-1].lstrip('-').replace('-', '_'), {}))
+        completer = own.pop('completer', None)
+        if not (given or own):
+            given['action'] = 'store_true'
+        elif given and given['type'] is None:
+            given['type'] = types.get(last.partition('.')[0])
+        action = group.add_argument(*names, help=' '.join(help_text.split()), **(given | own))
+        if completer is not None:
+            action.completer = completer  # as argcomplete takes it
+
+
 def add_settings_options(parser: argparse.ArgumentParser, *others: type[Dataclass]) -> None:
     """Add ``--config``, ``--gains`` and ``--set``, with the names in the tables that it takes."""
     rows = [*table(Settings), *(row for other in others for row in table(other))]
     gains = next(row for row in rows if row.name == 'gains')
-    group = parser.add_argument_group('estimator')
-    config = group.add_argument(
-        '--config',
-        type=named,
-        metavar='FILE',
-        help="the observer node's parameter file, or the name of one that comes with the package",
+    options(
+        parser.add_argument_group('estimator'),
+        """
+        --config FILE: the observer node's parameter file, or the name of one that comes with the
+            package
+        --gains: what sets the gains
+        --set NAME=VALUE: set a parameter; may be given several times
+        """,
+        config={'type': named, 'completer': config_files},
+        gains={'choices': gains.choices},
+        set={
+            'action': 'append',
+            'default': [],
+            'completer': lambda **_: [f'{row.name}=' for row in rows],
+        },
     )
-    completed_by(config, config_files)
-    group.add_argument('--gains', choices=gains.choices, help='what sets the gains')
-    assignment = group.add_argument(
-        '--set',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='set a parameter; may be given several times',
-    )
-    completed_by(assignment, lambda **_: [f'{row.name}=' for row in rows])
     basic, advanced = (
         ', '.join(row.name for row in rows if row.basic == is_basic) for is_basic in (True, False)
     )
@@ -245,60 +278,47 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     landmarks, ambiguous = (
         ', '.join(short_names('landmarks', is_ambiguous)) for is_ambiguous in (False, True)
     )
-    topics = parser.add_argument_group(
-        'topics', 'found by their types; a name is needed only where two fit'
-    )
-    for option, what in (
-        ('--velocity-topic', ', '.join(short_names('velocity'))),
-        (
-            '--landmarks-topic',
-            f'{landmarks}, clouds with ids; if named here or called landmarks, also clouds '
-            f'without, and {ambiguous}; if named, /tf with fiducials',
+    options(
+        parser.add_argument_group(
+            'topics', 'found by their types; a name is needed only where two fit'
         ),
-        ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
-        ('--pose-truth-topic', f'true pose: {", ".join(short_names("pose"))}'),
-        ('--landmark-truth-topic', 'true landmarks'),
-    ):
-        topics.add_argument(option, type=named, metavar='TOPIC', help=what)
-    inputs = parser.add_argument_group(
-        'inputs', "the node's parameters of these names, which --config and --set give as well"
+        f"""
+        --velocity-topic TOPIC: {', '.join(short_names('velocity'))}
+        --landmarks-topic TOPIC: {landmarks}, clouds with ids; if named here or called landmarks,
+            also clouds without, and {ambiguous}; if named, /tf with fiducials
+        --imu TOPIC: take the angular velocity from this Imu, the linear one as before
+        --pose-truth-topic TOPIC: true pose: {', '.join(short_names('pose'))}
+        --landmark-truth-topic TOPIC: true landmarks
+        """,
     )
-    inputs.add_argument(
-        '--velocity-source',
-        choices=_INPUT_ROWS['velocity_source'].choices,
-        help='what of Odometry is used: its twist (default), or the differences of its poses',
-    )
-    inputs.add_argument(
-        '--base-frame',
-        type=named,
-        metavar='FRAME',
-        help='frame whose pose is estimated; other sensors are placed in it by /tf and '
-        "/tf_static (default: the velocities' frame, or base_link if they name none)",
-    )
-    inputs.add_argument(
-        '--tag-frame-prefix',
-        metavar='PREFIX',
-        help="fiducials on /tf: a tag's frame before its id (default: "
-        f'{_INPUT_ROWS["tag_frame_prefix"].default}); family:id is known, too',
+    options(
+        parser.add_argument_group(
+            'inputs', "the node's parameters of these names, which --config and --set give as well"
+        ),
+        f"""
+        --velocity-source: what of Odometry is used: its twist (default), or the differences of its
+            poses
+        --base-frame FRAME: frame whose pose is estimated; other sensors are placed in it by /tf
+            and /tf_static (default: the velocities' frame, or base_link if they name none)
+        --tag-frame-prefix PREFIX: fiducials on /tf: a tag's frame before its id (default:
+            {_INPUT_ROWS['tag_frame_prefix'].default}); family:id is known, too
+        """,
+        velocity_source={'choices': _INPUT_ROWS['velocity_source'].choices},
     )
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how a recording is replayed, but for settings."""
     add_input_options(parser)
-    parser.add_argument(
-        '--load-map',
-        type=named_path,
-        metavar='FILE',
-        help='known landmarks, as --map writes them, or a folder of such maps, one of them that '
-        'of the place: the estimate is then in their frame, and has no ANEES of the pose '
-        '(nor of the configuration, if they are fixed)',
-    )
-    parser.add_argument(
-        '--smooth',
-        action='store_true',
-        help='estimate trajectory and map from all observations together, too; --tum and --map '
-        'then write these',
+    options(
+        parser,
+        """
+        --load-map FILE: known landmarks, as --map writes them, or a folder of such maps, one of
+            them that of the place: the estimate is then in their frame, and has no ANEES of the
+            pose (nor of the configuration, if they are fixed)
+        --smooth: estimate trajectory and map from all observations together, too; --tum and --map
+            then write these
+        """,
     )
 
 
@@ -345,11 +365,6 @@ def warn_of_unused(args: argparse.Namespace, given: Given) -> None:
     ]
     if unused:
         logger.warning('Not used of --config: %s.', ', '.join(unused))
-
-
-def add_force_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--force``."""
-    parser.add_argument('--force', action='store_true', help='replace files that exist already')
 
 
 def recording_path(text: str) -> Path:

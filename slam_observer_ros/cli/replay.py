@@ -16,15 +16,14 @@ from slam_observer_ros.cli.console import (
     show_progress,
 )
 from slam_observer_ros.cli.options import (
-    add_force_option,
     add_run_options,
     add_settings_options,
     check_inputs_are_kept,
     check_outputs,
-    named_path,
+    FORCE,
+    options,
     read_given,
     read_request,
-    recording_path,
     warn_of_unused,
 )
 from slam_observer_ros.common.errors import (
@@ -54,52 +53,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'Run a recording through the observer, as the node would have, and compare '
         'the outcome with the truth if the recording holds it.'
     )
-    parser.add_argument(
-        'recording',
-        type=named_path,
-        metavar='RECORDING',
-        help='.mcap, .db3 or ROS 1 .bag file, or rosbag2 directory',
-    )
+    options(parser, 'recording RECORDING: .mcap, .db3 or ROS 1 .bag file, or rosbag2 directory')
     add_run_options(parser)
-    outputs = parser.add_argument_group('outputs')
-    outputs.add_argument(
-        '--tum',
-        type=named_path,
-        metavar='FILE',
-        help='trajectory, as evo reads it, at most 20 poses a second',
+    options(
+        parser.add_argument_group('outputs'),
+        """
+        --tum FILE: trajectory, as evo reads it, at most 20 poses a second
+        --map FILE: landmarks, as YAML
+        --report OUT.html: one page for any browser, without a network: map, errors, residuals,
+            consistency and calibration over time, whose figures it saves as PNG or SVG
+        --mcap OUT.mcap: the estimate as the node would have published it, for Foxglove and others
+        --with-inputs: --mcap has the messages that came in, too
+        --explain ID: print the life of a landmark, too: when it was new, the residual of each
+            observation, and why points of it were not used
+        --json: print one JSON object
+        """,
     )
-    outputs.add_argument('--map', type=named_path, metavar='FILE', help='landmarks, as YAML')
-    outputs.add_argument(
-        '--report',
-        type=named_path,
-        metavar='OUT.html',
-        help='one page for any browser, without a network: map, errors, residuals, consistency '
-        'and calibration over time, whose figures it saves as PNG or SVG',
+    options(
+        parser,
+        f"""
+        --strict: end with exit code 3 if anything of the recording was lost: if it is damaged, cut
+            off, or has malformed messages; or if no velocity or no observation of it was used
+        {FORCE}
+        """,
     )
-    outputs.add_argument(
-        '--mcap',
-        type=recording_path,
-        metavar='OUT.mcap',
-        help='the estimate as the node would have published it, for Foxglove and others',
-    )
-    outputs.add_argument(
-        '--with-inputs', action='store_true', help='--mcap has the messages that came in, too'
-    )
-    outputs.add_argument(
-        '--explain',
-        type=int,
-        metavar='ID',
-        help='print the life of a landmark, too: when it was new, the residual of each '
-        'observation, and why points of it were not used',
-    )
-    outputs.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument(
-        '--strict',
-        action='store_true',
-        help='end with exit code 3 if anything of the recording was lost: if it is damaged, cut '
-        'off, or has malformed messages; or if no velocity or no observation of it was used',
-    )
-    add_force_option(parser)
     add_settings_options(parser, InputSettings)
     parser.set_defaults(run=run)
 

@@ -16,13 +16,12 @@ import numpy as np
 
 from slam_observer_ros.cli.console import print_json, print_table, show_progress
 from slam_observer_ros.cli.options import (
-    add_force_option,
     add_settings_options,
     check_directory,
     check_outputs,
-    named_path,
+    FORCE,
+    options,
     read_given,
-    recording_path,
     settings_of,
     value_of,
 )
@@ -122,10 +121,10 @@ MAX_STEPS = 10_000_000
 FIGURES = ('lyapunov', 'configuration')
 
 _SCENARIO_OPTIONS = {
-    '--seed': 'seed',
-    '--bias': 'initial_bias',
-    '--landmarks': 'landmark_count',
-    '--distance': 'landmark_distance',
+    'seed': 'seed',
+    'initial_bias': 'bias',
+    'landmark_count': 'landmarks',
+    'landmark_distance': 'distance',
 }
 
 
@@ -136,46 +135,37 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'radius and sees landmarks whose first sighting is biased; the observer makes up for it, '
         "with the paper's constant gains if --gains names no others."
     )
-    parser.add_argument(
-        '--duration', type=float, default=80.0, metavar='S', help='simulated seconds (default 80)'
-    )
-    parser.add_argument(
-        '--step',
-        type=float,
-        default=0.02,
-        metavar='S',
-        help='seconds from one velocity and observation to the next (default 0.02)',
+    options(
+        parser,
+        """
+        --duration S: simulated seconds (default 80)
+        --step S: seconds from one velocity and observation to the next (default 0.02)
+        """,
+        duration={'default': 80.0},
+        step={'default': 0.02},
     )
     rows = {row.name: row for row in table(Scenario)}
-    for option, name in _SCENARIO_OPTIONS.items():
+    for name, option in _SCENARIO_OPTIONS.items():
         row = rows[name]
         text = row.description[0].lower() + row.description[1:]
         unit = f' [{row.unit}]' if row.unit else ''
-        parser.add_argument(
-            option,
-            dest=name,
-            type=value_of(row),
-            default=row.default,
-            metavar='N' if isinstance(row.default, int) else 'M',
-            help=f'{text}{unit} (default {row.default})',
+        number = 'N' if isinstance(row.default, int) else 'M'
+        options(
+            parser,
+            f'--{option} {number}: {text}{unit} (default {row.default})',
+            **{option: {'dest': name, 'type': value_of(row), 'default': row.default}},
         )
-    parser.add_argument(
-        '--output', type=recording_path, metavar='OUT.mcap', help='write a recording'
+    options(
+        parser,
+        f"""
+        --output OUT.mcap: write a recording
+        --plot DIR: draw the figures {', '.join(FIGURES)}
+        --plot-format: what the figures are written as (default png)
+        --json: print one JSON object
+        {FORCE}
+        """,
+        plot_format={'choices': ('png', 'svg', 'pdf'), 'default': 'png'},
     )
-    parser.add_argument(
-        '--plot',
-        type=named_path,
-        metavar='DIR',
-        help=f'draw the figures {", ".join(FIGURES)}',
-    )
-    parser.add_argument(
-        '--plot-format',
-        choices=('png', 'svg', 'pdf'),
-        default='png',
-        help='what the figures are written as (default png)',
-    )
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    add_force_option(parser)
     add_settings_options(parser)
     parser.set_defaults(run=run)
 
@@ -248,7 +238,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
             f'--duration {args.duration:g} in steps of {args.step:g} are more than {MAX_STEPS} '
             'steps; take a shorter one, or longer steps'
         )
-    values = {name: getattr(args, name) for name in _SCENARIO_OPTIONS.values()}
+    values = {name: getattr(args, name) for name in _SCENARIO_OPTIONS}
     values['duration'] = args.duration
     values['velocity_rate'] = values['observation_rate'] = 1.0 / args.step
     return from_parameters(Scenario, values)
