@@ -7,24 +7,29 @@ file of its own, so that no two programs write to one; what one reads is all of 
 from __future__ import annotations
 
 import argparse
+import asyncio
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent import futures
+from contextlib import AbstractContextManager, contextmanager
 import dataclasses
 from dataclasses import dataclass, replace
 import fcntl
+from functools import partial
 import glob
 import hashlib
 import itertools
 import json
 import logging
+import multiprocessing
 import os
 from pathlib import Path
 import re
+import signal
 import sys
-from typing import Any
+import threading
+from typing import Any, Generic, TypeVar
 
-from slam_observer_ros.cli.batch_pool import cluster_pool, local_pool, Pool
 from slam_observer_ros.cli.console import print_json, print_table, show_message, show_progress
 from slam_observer_ros.cli.options import (
     add_run_options,
@@ -40,8 +45,10 @@ from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import (
     IncompleteError,
     json_text,
+    message_of,
     OutputError,
     shown,
+    SlamObserverError,
     UsageError,
 )
 from slam_observer_ros.common.files import destination, not_special, unfinished_file
@@ -49,8 +56,7 @@ from slam_observer_ros.common.findings import kept_warnings, muted_warnings
 from slam_observer_ros.mapping.map_file import map_files
 from slam_observer_ros.recordings.opening import sha256_of
 from slam_observer_ros.recordings.trajectory import write_tum
-from slam_observer_ros.report.batch_index import FILES, INDEX, Line, SCORES, write_index
-from slam_observer_ros.report.page import write_report
+from slam_observer_ros.report.page import FILES, INDEX, Line, SCORES, write_index, write_report
 from slam_observer_ros.report.summary import as_json, FIGURES, identity, summary_rows
 from slam_observer_ros.runs.replay import result_of
 from slam_observer_ros.runs.result import Request
@@ -176,7 +182,9 @@ def run(args: argparse.Namespace) -> None:
     request = read_request(args, read_given(args), recordings[0])
     requests = [request.with_values(point) for point in points]
     # Asked before anything is written
-    pool = _pool(args, local_pool(args.workers), len(recordings) * len(points))
+    pool = local_pool(args.workers)
+    if args.scheduler is not None:
+        pool = cluster_pool(args.scheduler, len(recordings) * len(points))
     wanted = {'report': args.reports, 'trajectory': args.trajectories}
     _make_folders(args)
     failed_file = args.out / log_name('failed', args.shard)
@@ -184,7 +192,17 @@ def run(args: argparse.Namespace) -> None:
         done_before = read_logs(args.out)
         parts = zip(recordings, part_of(recordings, len(points), args.shard), strict=True)
         parts_of_shard = {recording: part for recording, part in parts if part}
-        hashes, failures = _hashes(args, list(parts_of_shard))
+        hashes: dict[Path, str] = {}
+        failures: list[Failure] = []
+        of_files = Pool(futures.ThreadPoolExecutor, args.workers)
+        if args.scheduler is not None:
+            of_files = cluster_pool(args.scheduler, len(parts_of_shard))
+        hashing = of_files.run(sha256_of, parts_of_shard)
+        for hashed in show_progress(hashing, 'hashing', len(parts_of_shard)):
+            if hashed.result is not None:
+                hashes[hashed.job] = hashed.result
+            else:
+                failures.append(_failed(hashed.job, hashed.failure))
         jobs = [
             make_job(
                 replace(requests[number], recording=recording), hashes[recording], points[number]
@@ -238,11 +256,6 @@ def _worker_count(text: str) -> int:
     return int(text)
 
 
-def _pool(args: argparse.Namespace, local: Pool, jobs: int) -> Pool:
-    """Return the pool of ``--scheduler`` for so many jobs, or the one of this machine."""
-    return local if args.scheduler is None else cluster_pool(args.scheduler, jobs)
-
-
 def _make_folders(args: argparse.Namespace) -> None:
     """Make the directories of the outputs, whose files must not be in the way either."""
     wanted = {REPORTS: args.reports, TRAJECTORIES: args.trajectories}
@@ -255,21 +268,6 @@ def _make_folders(args: argparse.Namespace) -> None:
             raise OutputError(f"can't make the directory {folder}: {error.strerror}") from error
     for file in (*(log_name(kind, args.shard) for kind in ('runs', 'failed')), INDEX):
         destination(args.out / file)
-
-
-def _hashes(
-    args: argparse.Namespace, recordings: Sequence[Path]
-) -> tuple[dict[Path, str], list[Failure]]:
-    """Return the hash of each recording, and which can't be read."""
-    pool = _pool(args, Pool(ThreadPoolExecutor, args.workers), len(recordings))
-    hashes: dict[Path, str] = {}
-    failures = []
-    for ended in show_progress(pool.run(sha256_of, recordings), 'hashing', len(recordings)):
-        if ended.result is not None:
-            hashes[ended.job] = ended.result
-        else:
-            failures.append(_failed(ended.job, ended.failure))
-    return hashes, failures
 
 
 def _failed(recording: Path, reason: str, job: Job | None = None) -> Failure:
@@ -355,14 +353,9 @@ def make_job(request: Request, sha256: str, point: Point) -> Job:
 
 
 _NEEDED = {
-    'run': str,
-    'recording': str,
-    'recording_sha256': str,
-    'version': str,
-    'settings': dict,
-    'grid': dict,
-    'warnings': list,
-}
+    **dict.fromkeys(('run', 'recording', 'recording_sha256', 'version'), str),
+    'settings': dict, 'grid': dict, 'warnings': list,
+}  # fmt: skip
 
 
 def log_name(kind: str, shard: tuple[int, int]) -> str:
@@ -469,3 +462,156 @@ def _is_finite(value: object) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return -sys.float_info.max <= value <= sys.float_info.max
+
+
+CONNECT_S = 10.0
+"""How long the scheduler of a cluster may take to answer."""
+
+_Job = TypeVar('_Job')
+_Result = TypeVar('_Result')
+_OpenExecutor = Callable[[int], AbstractContextManager[futures.Executor]]
+
+
+@dataclass(frozen=True, slots=True)
+class Ended(Generic[_Job, _Result]):
+    """A job that has ended: with a result, or else with the reason why there is none."""
+
+    job: _Job
+    result: _Result | None
+    failure: str = ''
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """Does jobs, at most ``width`` at a time."""
+
+    open_executor: _OpenExecutor
+    width: int
+
+    def run(
+        self, work: Callable[[_Job], _Result], jobs: Iterable[_Job]
+    ) -> Iterator[Ended[_Job, _Result]]:
+        """Do jobs; yield each when it has ended. Jobs that run when the caller stops are lost."""
+        waiting = deque(jobs)
+        while waiting:
+            suspects: list[_Job] = []
+            with self.open_executor(min(self.width, len(waiting))) as executor:
+                running: dict[futures.Future[_Result], _Job] = {}
+                while running or (waiting and not suspects):
+                    while waiting and not suspects and len(running) < self.width:
+                        # Ctrl-C is held back until processes that begin are prepared for it.
+                        held_before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+                        try:
+                            running[executor.submit(work, waiting[0])] = waiting[0]
+                        except futures.BrokenExecutor:
+                            break
+                        finally:
+                            signal.pthread_sigmask(signal.SIG_SETMASK, held_before)
+                        waiting.popleft()
+                    if not running:
+                        break
+                    done, _ = futures.wait(running, return_when=futures.FIRST_COMPLETED)
+                    for future in done:
+                        job = running.pop(future)
+                        ended = _ended(job, future)
+                        if ended is None:
+                            suspects.append(job)
+                        else:
+                            yield ended
+            # A process has died. Which job's fault that was shows when each runs alone.
+            for job in suspects:
+                if self.width == 1:
+                    yield Ended(job, None, 'its process died: killed, or out of memory')
+                else:
+                    yield from Pool(self.open_executor, 1).run(work, [job])
+
+
+def _ended(job: _Job, future: futures.Future[_Result]) -> Ended[_Job, _Result] | None:
+    """Return how a job has ended; None if a process died, its own or another one."""
+    try:
+        return Ended(job, future.result())
+    except futures.BrokenExecutor:
+        return None
+    except (SlamObserverError, OSError) as error:
+        return Ended(job, None, message_of(error))
+    except futures.CancelledError:
+        return Ended(job, None, 'cancelled: the scheduler is gone')
+    except Exception as error:  # noqa: BLE001 (of whatever kind: the other runs are to be done)
+        return Ended(job, None, f'{type(error).__name__}: {" ".join(str(error).split())}')
+
+
+def local_pool(workers: int) -> Pool:
+    """Return a pool of processes of this machine."""
+    return Pool(_processes, workers)
+
+
+def cluster_pool(address: str, jobs: int) -> Pool:
+    """Return a pool of a Dask scheduler's workers, which share out all jobs among them.
+
+    Raises a UsageError if no scheduler answers there.
+    """
+    with _cluster(address, jobs):
+        pass
+    return Pool(partial(_cluster, address), jobs)
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[futures.Executor]:
+    others = set(multiprocessing.active_children())
+    executor = futures.ProcessPoolExecutor(
+        count, multiprocessing.get_context('spawn'), initializer=_prepare_process
+    )
+    is_done = False
+    try:
+        yield executor
+        is_done = True
+    finally:
+        if not is_done:  # Ctrl-C: what runs now is not waited for
+            for process in set(multiprocessing.active_children()) - others:
+                process.terminate()
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _prepare_process() -> None:
+    """Leave Ctrl-C to the batch, and end with it, also when it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if (parent := multiprocessing.parent_process()) is not None:
+
+        def end_with_parent() -> None:
+            parent.join()
+            os._exit(1)
+
+        threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+@contextmanager
+def _cluster(address: str, _: int) -> Iterator[futures.Executor]:
+    try:
+        from distributed import Client
+        from distributed.cfexecutor import ClientExecutor
+        from distributed.comm import connect
+        from distributed.security import Security
+    except ImportError as error:
+        raise UsageError(
+            "--scheduler needs Dask: pip install 'slam_observer_ros[cluster]'"
+        ) from error
+
+    async def try_to_connect() -> None:
+        options = Security().get_connection_args('client')
+        await (await connect(address, CONNECT_S, **options)).close()
+
+    try:
+        # A client that has failed would try to close its connection when the program ends.
+        asyncio.run(asyncio.wait_for(try_to_connect(), CONNECT_S))
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except Exception as error:  # of any kind, as what an address is depends on its protocol
+        reason = f': {error}' if str(error) else ''
+        raise UsageError(
+            f'--scheduler {address}: no Dask scheduler answers there{reason}'
+        ) from error
+    with client:
+        executor: futures.Executor = ClientExecutor(client, pure=False)
+        try:
+            yield executor
+        finally:
+            executor.shutdown(wait=False)  # nothing runs any more, or it is not to

@@ -48,11 +48,14 @@ from slam_observer_ros.runs.calibration import (
     HELD_OUT_SHARE,
     judge,
     Material,
+    NoiseFactor,
+    of_motion,
     read_material,
+    rounded,
+    scaled,
     Verdict,
 )
 from slam_observer_ros.runs.health import of_mounting, of_noise
-from slam_observer_ros.runs.noise_search import NoiseFactor, of_motion, rounded, scaled
 from slam_observer_ros.runs.result import Request
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import InputSettings

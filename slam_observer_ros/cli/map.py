@@ -17,7 +17,8 @@ from slam_observer_ros.cli.options import (
     options,
 )
 from slam_observer_ros.lie.axes import axes_of
-from slam_observer_ros.mapping.map_check import look_around, place_for_another, symmetries
+from slam_observer_ros.mapping.finder import look_around
+from slam_observer_ros.mapping.map_alignment import place_for_another, symmetries
 from slam_observer_ros.mapping.map_file import read_map, write_map
 from slam_observer_ros.mapping.map_import import import_map, LENGTHS, TAG_AXES
 from slam_observer_ros.settings.estimator_settings import ERROR_PROBABILITY, Settings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 import logging
 import math
@@ -11,11 +11,19 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found
-from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie.axes import EstimatedAxes
 from slam_observer_ros.mapping.constellation import find_places, MAX_LOOKS
 from slam_observer_ros.mapping.landmark_map import LandmarkMap, MappedLandmarks
-from slam_observer_ros.mapping.map_alignment import AlikeMaps, Likeness, likeness_by_ids
-from slam_observer_ros.mapping.map_check import place_for_another, symmetries, turns_onto
+from slam_observer_ros.mapping.map_alignment import (
+    AlikeMaps,
+    Likeness,
+    likeness_by_ids,
+    place_for_another,
+    symmetries,
+    turns_onto,
+)
 from slam_observer_ros.mapping.places import (
     Anywhere,
     Constellation,
@@ -246,3 +254,76 @@ class _SearchedMap:
 def _largest_mass(places: Places) -> float:
     """Return ln of the mass of the most likely place."""
     return places.all[0].log_mass if places.all else -math.inf
+
+
+MAX_PLACES, MAX_SEEN = 600, 12
+"""Places of a look around, and landmarks in view that it goes by."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """What q looks around from places all over a map say."""
+
+    poses: FloatArray  # (q, 4, 4)
+    seen: IntArray  # (q,) landmarks in view
+    fitting: IntArray  # (q,) places where these fit; 0 where they are too few
+    error_probabilities: FloatArray  # (q,) that the most likely place is wrong
+    is_found: BoolArray  # (q,) is it sure enough
+
+
+def look_around(
+    known: LandmarkMap,
+    axes: EstimatedAxes,
+    view_m: float,
+    fov_rad: float,
+    sigma_m: float,
+    map_sigma_m: float,
+    error_probability: float,
+) -> Looks:
+    """Look around from places all over a map, by a sensor that sees ``view_m`` far.
+
+    ``fov_rad`` is its field of view, and ``sigma_m`` the noise of each coordinate; ``map_sigma_m``
+    is for landmarks whose file gives none.
+    """
+    covariances = known.covariances_or(map_sigma_m)
+    mapped = MappedLandmarks(known.world_points, covariances, axes)
+    mapped.reach(2.0 * view_m)
+    poses = _poses(known.world_points, fov_rad)
+    results = []
+    for pose in poses:
+        points = _seen(known.world_points, pose, view_m, fov_rad)
+        covariance = sigma_m**2 * np.eye(axes.point * len(points))
+        constellation = Constellation(points, covariance, np.full(len(points), -1))
+        if len(points) <= axes.point:
+            results.append((len(points), 0, 1.0, False))
+            continue
+        places = find_places(mapped, constellation, Anywhere(mapped), error_probability)
+        fitting = sum(place.share > error_probability for place in places.all)
+        is_found = places.decided(error_probability) is not None
+        results.append((len(points), fitting, places.error_probability, is_found))
+    return Looks(poses, *(np.array(column) for column in zip(*results, strict=True)))
+
+
+def _poses(points: FloatArray, fov_rad: float) -> FloatArray:
+    """Return poses (q, 4, 4) all over the area of the landmarks, some headings at each place."""
+    low, high = points.min(axis=0)[:2], points.max(axis=0)[:2]
+    headings = 1 if fov_rad >= 2.0 * math.pi else 4
+    sides_m = np.maximum(high - low, 1.0)
+    step_m = math.sqrt(float(np.prod(sides_m)) * headings / MAX_PLACES)
+    x, y = np.meshgrid(
+        *(np.arange(a + 0.5 * step_m, b, step_m) for a, b in zip(low, low + sides_m, strict=True))
+    )
+    at = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, np.median(points[:, 2]))])
+    yaws = 2.0 * math.pi * np.arange(headings) / headings
+    turns = so3.exp(np.column_stack([np.zeros((headings, 2)), yaws]))
+    return np.array([se3.pose(R, position) for position in at for R in turns])
+
+
+def _seen(points: FloatArray, pose: FloatArray, view_m: float, fov_rad: float) -> FloatArray:
+    """Return the nearest points (m, 3) in view, body frame."""
+    points = se3.transform(se3.inverse(pose), points)
+    ranges_m = np.linalg.norm(points[:, :2], axis=1)
+    bearings = np.abs(np.arctan2(points[:, 1], points[:, 0]))
+    in_view = np.flatnonzero((ranges_m <= view_m) & (bearings <= 0.5 * fov_rad))
+    nearest: FloatArray = points[in_view[np.argsort(ranges_m[in_view])][:MAX_SEEN]]
+    return nearest

@@ -8,6 +8,8 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import combinations
 import logging
+import math
+from typing import Any
 
 import numpy as np
 
@@ -298,3 +300,94 @@ def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> 
         relative[:k, :k] = seen
         covariance[3:, 3:] += pose[:3, :3] @ relative @ pose[:3, :3].T
     return TagPose(int(known.ids[at]), pose, covariance, known)
+
+
+MAX_ALIKE = 64
+"""Landmarks that the outermost one of a map is taken to be, at most."""
+
+CELLS = 40
+"""Along the longer side of a map, free places for one more landmark."""
+
+
+def symmetries(known: LandmarkMap) -> list[Likeness]:
+    """Return the turns about the vertical after which a map looks the same, the best first.
+
+    Of turns that are as good the smallest is the first, as it makes the others.
+    """
+    found = turns_onto(known, known)
+    turned = [each for each in found if each.turn_deg > LEAST_TURN_DEG]
+    return sorted(turned, key=lambda each: (-int(each.is_same.sum()), round(each.turn_deg)))
+
+
+def turns_onto(known: LandmarkMap, other: LandmarkMap) -> list[Likeness]:
+    """Return the turns about the vertical after which a map looks as another, whatever its ids.
+
+    Any of these takes the centre of the landmarks to the other centre, and the outermost landmark
+    to one as far from there.
+    """
+    from scipy.spatial import cKDTree  # which few runs need
+
+    points, others = known.world_points, other.world_points
+    sizes = sorted((len(points), len(others)))
+    if sizes[0] < LEAST_SAME or sizes[0] < SAME_SHARE * sizes[1]:
+        return []
+    radii_m, angles = _from_centre(points)
+    other_radii_m, other_angles = _from_centre(others)
+    first, tree = int(np.argmax(radii_m)), cKDTree(others)
+    tolerance_m = SAME_M + 2.0 * radii_m[first] * (1.0 - SAME_SHARE)
+    off_m = np.abs(other_radii_m - radii_m[first])
+    alike = np.argsort(off_m)[: min(MAX_ALIKE, int(np.count_nonzero(off_m < tolerance_m)))]
+    found: list[Likeness] = []
+    for angle in other_angles[alike] - angles[first]:
+        likeness = _fitted(points, others, tree, angle)
+        T = likeness.transform
+        turns_rad = [so3.log(T[:3, :3] @ each.transform[:3, :3].T) for each in found]
+        is_new = all(np.linalg.norm(turn) > math.radians(LEAST_TURN_DEG) for turn in turns_rad)
+        if is_new and likeness.is_same.mean() >= SAME_SHARE:
+            found.append(likeness)
+    return found
+
+
+def _from_centre(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far points are from their centre, metres, and in which direction, rad."""
+    offsets = points - points.mean(axis=0)
+    return np.linalg.norm(offsets[:, :2], axis=1), np.arctan2(offsets[:, 1], offsets[:, 0])
+
+
+def _fitted(points: FloatArray, others: FloatArray, tree: Any, angle: float) -> Likeness:
+    """Return the turn by about an angle that fits best, the nearest landmarks being the same."""
+    centre, other_centre = points.mean(axis=0), others.mean(axis=0)
+    R = so3.exp(np.array([0.0, 0.0, angle]))
+    T = se3.pose(R, other_centre - R @ centre)
+    flat = np.array([1.0, 1.0, 0.0])
+    for tolerance_m in (10.0 * SAME_M, 3.0 * SAME_M, SAME_M):
+        distances_m, near = tree.query(se3.transform(T, points))
+        is_same = distances_m <= tolerance_m
+        if is_same.mean() < SAME_SHARE:
+            break
+        z_m = (others[near[is_same]] - points[is_same])[:, 2].mean()
+        T = rigid_alignment(points[is_same] * flat, others[near[is_same]] * flat)
+        T[2, 3] = z_m
+    return Likeness(T, np.asarray(is_same))
+
+
+def place_for_another(known: LandmarkMap, symmetry: Likeness) -> FloatArray:
+    """Return where (3,) one more landmark shows best which way round the map is, metres.
+
+    Among free places in the map, that which is furthest from all landmarks, from where these would
+    be if the map was turned, and from where it would be itself.
+    """
+    from scipy.spatial import cKDTree
+
+    points, T = known.world_points, symmetry.transform
+    low, high = points.min(axis=0)[:2], points.max(axis=0)[:2]
+    step_m = max(float((high - low).max()) / CELLS, 1e-3)
+    x, y = np.meshgrid(
+        *(np.arange(a, b + 0.5 * step_m, step_m) for a, b in zip(low, high, strict=True))
+    )
+    free = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, np.median(points[:, 2]))])
+    own = np.linalg.norm((free - se3.transform(T, free))[:, :2], axis=1)
+    tree, turned = cKDTree(points[:, :2]), cKDTree(se3.transform(T, points)[:, :2])
+    from_others = np.minimum(tree.query(free[:, :2])[0], turned.query(free[:, :2])[0])
+    best: FloatArray = free[np.argmax(np.minimum(from_others, 0.5 * own))]
+    return best

@@ -10,7 +10,7 @@ import pytest
 import recordings
 
 from slam_observer_ros.cli import batch
-from slam_observer_ros.cli.batch_pool import Pool
+from slam_observer_ros.cli.batch import Pool
 from slam_observer_ros.cli.main import main
 
 

@@ -20,12 +20,11 @@ import numpy as np
 import pytest
 from recordings import events, write_mcap, write_rosbag1
 
-from slam_observer_ros.cli.batch import grid_points, opened_log, part_of, read_logs
-from slam_observer_ros.cli.batch_pool import local_pool
+from slam_observer_ros.cli.batch import grid_points, local_pool, opened_log, part_of, read_logs
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.report.batch_index import write_index
+from slam_observer_ros.report.page import write_index
 from slam_observer_ros.report.summary import FIGURES
 
 PATIENCE_S = 60.0

@@ -12,7 +12,7 @@ import time
 import pytest
 from recordings import SAMPLE
 
-from slam_observer_ros.cli import batch_pool
+from slam_observer_ros.cli import batch as batch_module
 from slam_observer_ros.cli.batch import read_logs
 
 pytest.importorskip('distributed', reason="no Dask is installed (pip's extra 'cluster')")
@@ -130,7 +130,7 @@ def test_a_scheduler_that_can_not_be_is_an_error_in_one_line(tmp_path):
 def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(
     monkeypatch, slam_observer, tmp_path
 ):
-    monkeypatch.setattr(batch_pool, 'CONNECT_S', 1.0)
+    monkeypatch.setattr(batch_module, 'CONNECT_S', 1.0)
     options = ('batch', SAMPLE, '--out', tmp_path / 'r', '--scheduler', 'tcp://127.0.0.1:9')
     assert 'no Dask scheduler answers there' in slam_observer.fail(*options)
     assert not list(tmp_path.iterdir())

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.lie.axes import PLANAR
-from slam_observer_ros.mapping.finder import warn_of_symmetry
+from slam_observer_ros.mapping.finder import look_around, warn_of_symmetry
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.mapping.map_check import (
-    look_around,
-    place_for_another,
-    symmetries,
-)
+from slam_observer_ros.mapping.map_alignment import place_for_another, symmetries
 from slam_observer_ros.mapping.map_file import write_map
 
 

@@ -10,8 +10,9 @@ import yaml
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.runs.calibration import judge, Judged
-from slam_observer_ros.runs.noise_search import (
+from slam_observer_ros.runs.calibration import (
+    judge,
+    Judged,
     kinds_of,
     most_likely,
     remembered,
