@@ -43,6 +43,7 @@ from slam_observer_ros.cli.options import (
 )
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import (
+    failing,
     IncompleteError,
     json_text,
     message_of,
@@ -262,10 +263,8 @@ def _make_folders(args: argparse.Namespace) -> None:
     folders = [args.out / name for name, is_wanted in wanted.items() if is_wanted]
     for folder in (args.out, *folders):
         check_directory(folder)
-        try:
+        with failing(OutputError, f"can't make the directory {folder}"):
             folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"can't make the directory {folder}: {error.strerror}") from error
     for file in (*(log_name(kind, args.shard) for kind in ('runs', 'failed')), INDEX):
         destination(args.out / file)
 
@@ -399,12 +398,10 @@ def opened_log(path: Path) -> Iterator[Callable[[Mapping[str, object]], None]]:
 
         def append(line: Mapping[str, object]) -> None:
             left = json_text(line).encode() + b'\n'
-            try:
+            with failing(OutputError, f"can't write {path}"):
                 while left:
                     left = left[file.write(left) :]
                 os.fsync(file.fileno())
-            except OSError as error:
-                raise OutputError(f"can't write {path}: {error.strerror}") from error
 
         yield append
 

@@ -47,9 +47,9 @@ from slam_observer_ros.runs.calibration import (
     growth,
     HELD_OUT_SHARE,
     judge,
+    kinds_of,
     Material,
     NoiseFactor,
-    of_motion,
     read_material,
     rounded,
     scaled,
@@ -139,7 +139,12 @@ def run(args: argparse.Namespace) -> None:
     with muted_warnings(), progress_bar('calibrating') as advance:
         found = _found(args, request, materials, given, lambda: advance(1))
         stated = state_found(request.settings, request.inputs, found, _sensor_pose(request, found))
-        noisy = with_noise(stated, found, not _states_motion(materials))
+        states_motion = any(
+            isinstance(event, VelocityEvent) and event.covariance is not None
+            for material in materials
+            for event in material.events
+        )
+        noisy = with_noise(stated, found, not states_motion)
         corrected = replace(request, inputs=stated.inputs)
         trained_on = materials
         if corrected != request:
@@ -223,16 +228,6 @@ def _sensor_pose(request: Request, found: Found) -> FloatArray | None:
     with Recording(request.recording) as recording:
         selected, inputs, _ = request.select_inputs(recording)
         return recording.sensor_pose(selected, inputs, next(iter(found.frames)))
-
-
-def _states_motion(materials: Sequence[Material]) -> bool:
-    """Return whether some velocities come with their covariances."""
-    return any(
-        event.covariance is not None
-        for material in materials
-        for event in material.events
-        if isinstance(event, VelocityEvent)
-    )
 
 
 def _print(args: argparse.Namespace, result: _Calibration) -> None:
@@ -377,7 +372,12 @@ def trades(parts: Sequence[CalibrationEstimate], correlations: FloatArray) -> li
     for i, j in np.argwhere(close).tolist():
         names, correlation = (parts[i].name, parts[j].name), float(correlations[i, j])
         entries = [_entry_of(name) for name in names]
-        words = ' and '.join(sorted(map(_words, entries)))
+        words = ' and '.join(
+            sorted(
+                _WORDS[entry.parameter] + ('' if entry.axis is None else f' {"xyz"[entry.axis]}')
+                for entry in entries
+            )
+        )
         kinds = {entry.parameter for entry in entries}
         advice = next(
             (advice for pair, advice in _ADVICE if pair <= kinds),
@@ -391,11 +391,6 @@ def trades(parts: Sequence[CalibrationEstimate], correlations: FloatArray) -> li
 def _entry_of(name: str) -> Entry:
     name = name.partition('/')[0]
     return next(entry for entry in (*OF_VELOCITY, *OF_SENSOR) if entry.name == name)
-
-
-def _words(entry: Entry) -> str:
-    words = _WORDS.get(entry.parameter, entry.parameter.replace('_', ' '))
-    return words if entry.axis is None else f'{words} {"xyz"[entry.axis]}'
 
 
 SEEN = 0.5
@@ -495,7 +490,7 @@ def with_noise(stated: Stated, found: Found, states_motion: bool) -> Stated:
     """Return the same with the noise that was found; of motion where messages state none."""
     noise = list(found.noise)
     factors = {part.name: part for part in found.factors} if states_motion else {}
-    for kind in of_motion(stated.settings):
+    for kind in kinds_of(stated.settings, of_points=False):
         part = factors.get(kind.name)
         if part is None:
             continue

@@ -15,7 +15,7 @@ from slam_observer_ros.cli.options import (
     FORCE,
     options,
 )
-from slam_observer_ros.common.errors import OutputError
+from slam_observer_ros.common.errors import failing, OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
@@ -167,11 +167,8 @@ def _run(args: argparse.Namespace) -> None:
 
 def _write_parameters(path: Path, _: DataSet) -> dict[str, str]:
     """Write the parameters without which the steps of a graph mean something else."""
-    try:
-        with unfinished_file(path) as file:
-            file.write(GRAPH_PARAMETERS)
-    except OSError as error:
-        raise OutputError(f"can't write {path}: {error.strerror}") from error
+    with failing(OutputError, f"can't write {path}"), unfinished_file(path) as file:
+        file.write(GRAPH_PARAMETERS)
     return {'parameters, but for noise': f'--config {path}'}
 
 

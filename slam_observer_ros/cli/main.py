@@ -130,11 +130,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except (SlamObserverError, OSError) as error:
         if isinstance(error, BrokenPipeError):
-            return _leave_broken_pipe()
+            # Whoever read the output has gone: the interpreter flushes to nowhere at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return SIGNALLED + signal.SIGPIPE
         show_message('error', message_of(error))
         return EXIT_OF.get(type(error), EXIT_ERROR)
     except ModuleNotFoundError as error:
-        _explain_missing(error)
+        package = (error.name or '').partition('.')[0]
+        if package not in OPTIONAL_PACKAGES:
+            raise
+        needed = f"'pip install {' '.join(OPTIONAL_PACKAGES)}' brings what is used"
+        show_message('error', f'{package} is not installed: {needed}')
         return EXIT_ERROR
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the interpreter would end by another one
@@ -144,23 +150,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return SIGNALLED + stop.number
     return 0
-
-
-def _explain_missing(error: ModuleNotFoundError) -> None:
-    """Show how a package comes that only the command line needs; raise for any other one."""
-    package = (error.name or '').partition('.')[0]
-    if package not in OPTIONAL_PACKAGES:
-        raise error
-    needed = ' '.join(OPTIONAL_PACKAGES)
-    show_message(
-        'error', f"{package} is not installed: 'pip install {needed}' brings what is used"
-    )
-
-
-def _leave_broken_pipe() -> int:
-    """Let the interpreter flush to nowhere at exit: whoever read the output has gone."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return SIGNALLED + signal.SIGPIPE
 
 
 if __name__ == '__main__':

@@ -135,12 +135,14 @@ class Given:
 def read_given(args: argparse.Namespace) -> Given:
     """Read what the options of :func:`add_settings_options` give."""
     file = None if args.config is None else find_config(args.config)
-    return Given(
-        file,
-        {} if file is None else read_parameter_file(file),
-        dict(_parse_assignment(text) for text in args.set),
-        args.gains,
-    )
+    config = {} if file is None else read_parameter_file(file)
+    assigned = {}
+    for text in args.set:
+        name, equals, value = text.partition('=')
+        if not (name and equals):
+            raise UsageError(f"--set takes NAME=VALUE, not '{text}'")
+        assigned[name] = parse_value(value)
+    return Given(file, config, assigned, args.gains)
 
 
 def settings_of(
@@ -222,14 +224,11 @@ def find_config(name: str) -> Path:
 
 def shipped_names() -> list[str]:
     """Return the names of the parameter files of the observer that come with the package."""
-    return sorted(name for name, file in _shipped_configs().items() if _is_for_observer(file))
-
-
-def _is_for_observer(file: Path) -> bool:
-    try:
-        return bool(read_parameter_file(file))
-    except ParameterError:
-        return False
+    names = []
+    for name, file in _shipped_configs().items():
+        with suppress(ParameterError):
+            names += [name] if read_parameter_file(file) else []
+    return sorted(names)
 
 
 def config_files(**context: Any) -> Sequence[str]:
@@ -254,13 +253,6 @@ def _shipped_configs() -> dict[str, Path]:
         *(file for prefix in reversed(prefixes) for file in (prefix / share).glob('*.yaml')),
     )
     return {file.stem: file for file in files}
-
-
-def _parse_assignment(text: str) -> tuple[str, object]:
-    name, equals, value = text.partition('=')
-    if not (name and equals):
-        raise UsageError(f"--set takes NAME=VALUE, not '{text}'")
-    return name, parse_value(value)
 
 
 _INPUT_ROWS = {row.name: row for row in table(InputSettings)}

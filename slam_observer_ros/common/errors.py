@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 import json
 import math
 import reprlib
@@ -86,6 +87,15 @@ class OutputError(SlamObserverError):
 
 class IncompleteError(SlamObserverError):
     """A part of what was asked for could not be done, or is of no avail; the rest is done."""
+
+
+@contextmanager
+def failing(kind: type[SlamObserverError], what: str) -> Iterator[None]:
+    """Raise what the system refuses as an error of a kind, which says ``what``, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f'{what}: {error.strerror}') from error
 
 
 _LEAST = 1e-4

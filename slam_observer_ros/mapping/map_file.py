@@ -42,7 +42,7 @@ import numpy as np
 import yaml
 
 from slam_observer_ros.common import __version__
-from slam_observer_ros.common.errors import MapError, shown, YamlError
+from slam_observer_ros.common.errors import failing, MapError, shown, YamlError
 from slam_observer_ros.common.files import (
     constructed,
     destination,
@@ -121,16 +121,13 @@ def write_map(
     on_one_line: Any = {'default_flow_style': True, 'sort_keys': False, 'width': 10**6}
     lines = [f'- {yaml.dump(each, Dumper=_Dumper, **on_one_line)}' for each in landmarks]
     lines += _correlation_lines(landmark_map.joint_covariance, landmarks)
-    try:
-        with unfinished_file(path) as file:
-            yaml.safe_dump(head, file, sort_keys=False)
-            file.write('landmarks:\n')
-            file.writelines(lines)
-            file.flush()  # and a full disk shows before anything is replaced
-            if backup is not None:
-                keep_copy(path, backup)
-    except OSError as error:
-        raise MapError(f"can't write map {path}: {error.strerror}") from error
+    with failing(MapError, f"can't write map {path}"), unfinished_file(path) as file:
+        yaml.safe_dump(head, file, sort_keys=False)
+        file.write('landmarks:\n')
+        file.writelines(lines)
+        file.flush()  # and a full disk shows before anything is replaced
+        if backup is not None:
+            keep_copy(path, backup)
 
 
 def check_writable(path: Path) -> None:
@@ -138,12 +135,10 @@ def check_writable(path: Path) -> None:
 
     Raise :exc:`MapError` if its directory takes no file, or the path is a directory.
     """
-    try:
+    with failing(MapError, f"can't write map {path}"):
         if path.is_dir():
             raise MapError(f"can't write map {path}: it is a directory")
         directory = destination(path).parent
-    except OSError as error:
-        raise MapError(f"can't write map {path}: {error.strerror}") from error
     try:
         with tempfile.TemporaryFile(dir=directory):
             pass
@@ -209,7 +204,7 @@ def read_maps(path: Path) -> list[LandmarkMap]:
 
 def map_files(path: Path) -> list[Path]:
     """Return the file of a map, or a folder's files, by name; MapError if there are none."""
-    try:
+    with failing(MapError, f"can't read map {path}"):
         if not path.is_dir():
             return [path]
         files = sorted(
@@ -217,8 +212,6 @@ def map_files(path: Path) -> list[Path]:
             for file in path.iterdir()
             if file.suffix in ('.yaml', '.yml') and not file.is_dir()
         )
-    except OSError as error:
-        raise MapError(f"can't read map {path}: {error.strerror}") from error
     if not files:
         raise MapError(f'there is no map, a file *.yaml, in the folder {path}')
     return files

@@ -210,7 +210,11 @@ def _tagslam_rows(
     entries: Sequence[Mapping[str, Any]], defaults: Mapping[str, Any], left_out: list[str]
 ) -> list[Row]:
     """Return the tags of bodies that stand still, and have a place in the map."""
-    bodies = [_tagslam_body(entry) for entry in entries]
+    for entry in entries:
+        if len(entry) != 1:
+            names = ', '.join(shown(name) for name in entry)
+            raise MapError(f'each body is an entry of its own in the list: {names}')
+    bodies = [body for entry in entries for body in entry.items()]
     static = [(name, body) for name, body in bodies if body.get('is_static', False)]
     left_out += [
         f'body {shown(name)}, which moves' for name, body in bodies if (name, body) not in static
@@ -233,14 +237,6 @@ def _tagslam_rows(
                 else:
                     left_out.append(f'tag {shown(tag["id"])}, which has no pose')
     return rows
-
-
-def _tagslam_body(entry: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-    if len(entry) != 1:
-        names = ', '.join(shown(name) for name in entry)
-        raise MapError(f'each body is an entry of its own in the list: {names}')
-    ((name, body),) = entry.items()
-    return name, body
 
 
 def _board_tags(board: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
@@ -436,7 +432,10 @@ def _cells(text: str) -> list[tuple[int, list[str]]]:
         return []
     first = written[0]
     if _is_number(first.split(',')[0].split(';')[0].split()[0]):
-        lines = [_uncommented(line) for line in lines]
+        # The names of columns may stand behind a #.
+        bare = [line.lstrip().lstrip('#').strip() for line in lines]
+        named = [{'id', 'x', 'y'} <= set(re.split(r'[\s,;]+', line.lower())) for line in bare]
+        lines = [b if is_named else a for a, b, is_named in zip(lines, bare, named, strict=True)]
     delimiter = next((sign for sign in ';\t' if sign in first), ',')
     is_spaced = delimiter == ',' and _WORDS.fullmatch(first.strip()) is not None
     reader = csv.reader(lines, delimiter=delimiter)
@@ -445,22 +444,13 @@ def _cells(text: str) -> list[tuple[int, list[str]]]:
         if is_spaced
         else ((reader.line_num, cells) for cells in reader)
     )
-    stripped = [(number, [_decimal(cell.strip()) for cell in cells]) for number, cells in found]
-    return [
-        (number, cells)
-        for number, cells in stripped
-        if any(cells) and not cells[0].startswith('#') and not cells[0].lower().startswith('sep=')
-    ]
-
-
-def _uncommented(line: str) -> str:
-    """Return a line as it is, or without its #, if it names the columns."""
-    bare = line.lstrip().lstrip('#').strip()
-    return bare if {'id', 'x', 'y'} <= set(re.split(r'[\s,;]+', bare.lower())) else line
-
-
-def _decimal(cell: str) -> str:
-    return cell.replace(',', '.') if _COMMA_OF_DECIMALS.fullmatch(cell) else cell
+    stripped = []
+    for number, raw in found:
+        cells = [cell.strip() for cell in raw]
+        cells = [c.replace(',', '.') if _COMMA_OF_DECIMALS.fullmatch(c) else c for c in cells]
+        if any(cells) and not cells[0].startswith('#') and not cells[0].lower().startswith('sep='):
+            stripped.append((number, cells))
+    return stripped
 
 
 def _columns(header: Sequence[str]) -> tuple[list[str], list[float]]:

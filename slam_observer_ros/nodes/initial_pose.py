@@ -14,6 +14,7 @@ from rclpy.node import Node
 import yaml
 
 from slam_observer_ros.common.errors import (
+    failing,
     MapError,
     MessageError,
     ParameterError,
@@ -299,12 +300,10 @@ def write_pose(path: Path, stored: StoredPose) -> None:
         content['odometry'] = [*x.tolist(), *so3.to_quaternion(R).tolist()]
     if stored.map_name:
         content['map'] = stored.map_name
-    try:
+    with failing(MapError, f"can't write the pose {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished_file(path) as file:
             yaml.safe_dump(content, file, sort_keys=False)
-    except OSError as error:
-        raise MapError(f"can't write the pose {path}: {error.strerror}") from error
 
 
 def read_pose(path: Path) -> StoredPose:

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.common.errors import EvaluationError, TransformError
+from slam_observer_ros.common.errors import EvaluationError, failing, TransformError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
@@ -176,12 +176,9 @@ def write_tum(trajectory: Trajectory, path: Path) -> Path:
         f'{_seconds_text(stamp_ns)} {" ".join(map(repr, row))}\n'
         for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), numbers, strict=True)
     )
-    try:
-        with unfinished_file(path) as file:
-            file.write(_TUM_HEADER)
-            file.writelines(lines)
-    except OSError as error:
-        raise EvaluationError(f"can't write {path}: {error.strerror}") from error
+    with failing(EvaluationError, f"can't write {path}"), unfinished_file(path) as file:
+        file.write(_TUM_HEADER)
+        file.writelines(lines)
     return path
 
 

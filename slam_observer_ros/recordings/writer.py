@@ -29,7 +29,7 @@ from rosbags.rosbag2 import (
 )
 from rosbags.typesys import get_typestore, Stores
 
-from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.common.errors import failing, RecordingError
 from slam_observer_ros.common.files import destination, unfinished_directory
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
@@ -78,12 +78,10 @@ class RecordingWriter:
             raise RecordingError(f'{self.path}: recordings are written as .mcap files')
         self._refuse_to_overwrite()
         self._directory = ExitStack()
-        try:
+        with failing(RecordingError, str(self.path)):
             # Beside its destination, so that the file can be moved there in one step.
             directory = destination(self.path).parent
             unfinished = self._directory.enter_context(unfinished_directory(directory))
-        except OSError as error:
-            raise RecordingError(f'{self.path}: {error.strerror}') from error
         self._bag = Writer(
             unfinished / self.path.stem,
             version=Writer.VERSION_LATEST,
@@ -140,10 +138,8 @@ class RecordingWriter:
                 typestore=self._typestore,
                 offered_qos_profiles=[_LATCHED] if latched else [],
             )
-        try:
+        with failing(RecordingError, str(self.path)):
             self._bag.write(self._connections[key], receive_stamp_ns, memoryview(data))
-        except OSError as error:
-            raise RecordingError(f'{self.path}: {error.strerror}') from error
 
     def knows(self, message_type: str) -> bool:
         """Return whether messages of a type can be written."""

@@ -18,9 +18,9 @@ from urllib.parse import quote
 import numpy as np
 
 from slam_observer_ros.common import __version__
-from slam_observer_ros.common.errors import json_text, OutputError, significant
+from slam_observer_ros.common.errors import failing, json_text, OutputError, significant
 from slam_observer_ros.common.files import unfinished_file
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.messages.estimate_messages import half_sights
 from slam_observer_ros.recordings.trajectory import interpolate
@@ -81,11 +81,8 @@ def write_report(path: Path, result: Result, title: str, rows: Mapping[str, str]
 def write_page(path: Path, template: str, parts: Mapping[str, str]) -> None:
     """Write a page with ``@NAME@`` replaced by the part of that name; OutputError if it fails."""
     page = re.sub('@([A-Z_]+)@', lambda mark: parts[mark.group(1)], asset(template))
-    try:
-        with unfinished_file(path) as file:
-            file.write(page.encode(errors='replace').decode())  # names may be no Unicode
-    except OSError as error:
-        raise OutputError(f"can't write {path}: {error.strerror}") from error
+    with failing(OutputError, f"can't write {path}"), unfinished_file(path) as file:
+        file.write(page.encode(errors='replace').decode())  # names may be no Unicode
 
 
 def asset(name: str) -> str:
@@ -329,7 +326,12 @@ def _consistency(result: Result) -> dict[str, Json]:
 def _residuals(result: Result) -> dict[str, Json]:
     """Return residuals in σ: of a great many the suspicious ones, and some of the others."""
     innovations = result.innovations
-    shown = _shown(innovations.weights, innovations.distances) | innovations.moved
+    weights, shown = innovations.weights, np.ones(len(innovations.weights), dtype=np.bool_)
+    if len(weights) > MAX_RESIDUALS:
+        shown = innovations.moved.copy()
+        shown[thinned(len(weights), MAX_RESIDUALS // 2)] = True
+        suspicious = np.flatnonzero((weights < 1.0) | (innovations.distances > 3.0))
+        shown[suspicious[thinned(len(suspicious), MAX_RESIDUALS // 2)]] = True
     return {
         't': rounded(result.seconds(innovations.stamps_ns[shown]), 2),
         'id': innovations.ids[shown].tolist(),
@@ -339,16 +341,6 @@ def _residuals(result: Result) -> dict[str, Json]:
         'moved': np.flatnonzero(innovations.moved[shown]).tolist(),
         'left_out': int(np.count_nonzero(~shown)),
     }
-
-
-def _shown(weights: FloatArray, distances: FloatArray) -> BoolArray:
-    shown = np.ones(len(weights), dtype=np.bool_)
-    if len(weights) > MAX_RESIDUALS:
-        shown[:] = False
-        shown[thinned(len(weights), MAX_RESIDUALS // 2)] = True
-        suspicious = np.flatnonzero((weights < 1.0) | (distances > 3.0))
-        shown[suspicious[thinned(len(suspicious), MAX_RESIDUALS // 2)]] = True
-    return shown
 
 
 def _outcomes(result: Result) -> dict[str, Json]:
@@ -408,21 +400,22 @@ _DEFAULTS = {row.name: row.default for row in table(Settings)}
 def write_index(directory: Path, lines: Mapping[str, Line], score: str) -> None:
     """Write index.html of all runs of a directory; raise an OutputError if it can't be written."""
     runs = sorted(lines.values(), key=lambda line: (_score(line, score), line['recording']))
-    names = _varying(runs)
+    # What runs differ in: settings, the grid's inputs, version.
+    named = {name for run in runs for name in (*run['settings'], *run['grid'])} | {'version'}
+    names = sorted(name for name in named if len({_text(run, name) for run in runs}) > 1)
     figures = [name for name in FIGURES if any(run.get(name) is not None for run in runs)]
     recordings = {run['recording_sha256'] for run in runs}
     summary = (
         f'{len(runs)} runs of {len(recordings)} recordings. The best (★) has least {score}. '
         'A click on a heading sorts.'
     )
+    tables = (table_of(runs, names, figures, score) for table_of in (_settings_table, _runs_table))
     parts = {
         'STYLE': asset('report.css'),
         'SCRIPT': asset('index.js'),
         'TITLE': escape(directory.resolve().name),
         'SUMMARY': escape(summary),
-        'TABLES': _settings_table(runs, names, figures, score)
-        + '\n'
-        + _runs_table(runs, names, figures, score),
+        'TABLES': '\n'.join(tables),
     }
     write_page(directory / INDEX, 'index.html', parts)
 
@@ -455,34 +448,6 @@ def _cell(value: float | str | None) -> str:
     return f'<td class="number" data-value="{value!r}">{text}</td>'
 
 
-def _range_cell(values: Sequence[float]) -> str:
-    """Return a cell from the least to the largest of numbers that should be 1.
-
-    It is sorted by the worst.
-    """
-    worst = max(abs(math.log(max(one, 1e-300))) for one in (min(values), max(values)))
-    text = f'{significant(min(values))} – {significant(max(values))}'
-    return f'<td class="number" data-value="{worst!r}">{text}</td>'
-
-
-def _links_cell(run: Line) -> str:
-    """Return a cell that leads to the files of a run, beside the page."""
-    links = (
-        f'<a href="{escape(quote(run[kind], errors="replace"))}">{kind}</a>'
-        for kind in FILES
-        if run.get(kind)
-    )
-    return f'<td class="links">{" ".join(links)}</td>'
-
-
-def _folded_cell(texts: Sequence[str]) -> str:
-    """Return a cell that shows how many texts there are, and the texts at a click."""
-    if not texts:
-        return '<td></td>'
-    items = ''.join(f'<li>{escape(text)}</li>' for text in texts)
-    return f'<td><details><summary>{len(texts)}</summary><ul>{items}</ul></details></td>'
-
-
 def _breakable(text: str) -> str:
     """Return a text that a narrow column breaks within its paths and names, but in no word."""
     return re.sub('([/_])', r'\1<wbr>', escape(text))
@@ -491,16 +456,6 @@ def _breakable(text: str) -> str:
 def _score(run: Line, score: str) -> float:
     value = run.get(score)
     return math.inf if value is None else float(value)
-
-
-def _varying(runs: Sequence[Line]) -> list[str]:
-    """Return the names of what runs differ in: settings, the grid's inputs, version."""
-    values: defaultdict[str, set[str]] = defaultdict(set)
-    names = {name for run in runs for name in (*run['settings'], *run['grid'])} | {'version'}
-    for run in runs:
-        for name in names:
-            values[name].add(_text(run, name))
-    return sorted(name for name in names if len(values[name]) > 1)
 
 
 def _text(run: Line, name: str) -> str:
@@ -519,19 +474,19 @@ def _settings_table(
     for run in runs:
         groups[tuple(_text(run, name) for name in names)].append(run)
 
-    def mean(group: Sequence[Line], name: str) -> float | None:
-        values = [float(run[name]) for run in group if run.get(name) is not None]
-        return float(np.mean(values)) if len(values) == len(group) else None
-
     def figure_cell(group: Sequence[Line], name: str) -> str:
         values = [float(run[name]) for run in group if run.get(name) is not None]
+        if len(values) < len(group):
+            return _cell(None)
         if name not in CONSISTENCY:
-            return _cell(mean(group, name))
-        return _range_cell(values) if len(values) == len(group) else _cell(None)
+            return _cell(float(np.mean(values)))
+        # Of what should be 1, from the least to the largest, sorted by the worst.
+        worst = max(abs(math.log(max(one, 1e-300))) for one in (min(values), max(values)))
+        text = f'{significant(min(values))} – {significant(max(values))}'
+        return f'<td class="number" data-value="{worst!r}">{text}</td>'
 
     def mean_score(group: Sequence[Line]) -> float:
-        value = mean(group, score)
-        return math.inf if value is None else value
+        return float(np.mean([_score(run, score) for run in group]))
 
     # One that has done fewer recordings is not comparable: they may have been the easy ones.
     ordered = sorted(groups.items(), key=lambda item: (-len(item[1]), mean_score(item[1])))
@@ -563,15 +518,24 @@ def _runs_table(
             best.setdefault(run['recording_sha256'], number)
         counts = run.get('used')
         is_known = isinstance(counts, dict) and all(isinstance(n, int) for n in counts.values())
+        links = (  # to its files, beside the page
+            f'<a href="{escape(quote(run[kind], errors="replace"))}">{kind}</a>'
+            for kind in FILES
+            if run.get(kind)
+        )
+        said = ''.join(f'<li>{escape(text)}</li>' for text in run['warnings'])
+        if said:  # how many there are, and the texts at a click
+            count = len(run['warnings'])
+            said = f'<details><summary>{count}</summary><ul>{said}</ul></details>'
         rows.append(
             [
                 _cell(run['recording'].removeprefix(folder)),
-                _links_cell(run),
+                f'<td class="links">{" ".join(links)}</td>',
                 *(_cell(_text(run, name)) for name in names),
                 # 0 is nothing at all, or the velocities alone.
                 _cell(used_points(Counter(counts)) if is_known else None),
                 *(_cell(run.get(name)) for name in figures),
-                _folded_cell(run['warnings']),
+                f'<td>{said}</td>',
                 _cell(run['run']),
             ]
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,6 +39,9 @@ from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.runs.result import Request
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.settings.parameter_table import table, Value
+
+Advance = Callable[[], None]
+"""Called at each run."""
 
 BLOCKS = 20
 """Parts of a recording in time by which it is judged whether a gain may be chance."""
@@ -149,7 +153,7 @@ class Material:
     landmark_map: LandmarkMap | None = None
 
     def likelihood(self, settings: Settings) -> Likelihood:
-        """Return the figure of the part to train on."""
+        """Return how likely the part to train on is."""
         return self.trained(settings)[1]
 
     def trained(self, settings: Settings) -> tuple[Estimator, Likelihood]:
@@ -350,23 +354,14 @@ MAX_BEHIND = 0.01
 
 
 class CalibrationFinder:
-    """Finds what ``material`` shows; what is ``kept`` is as settings state it.
-
-    ``advance`` is called at each run.
-    """
+    """Finds what ``material`` shows; what is ``kept`` is as settings state it."""
 
     def __init__(
-        self,
-        material: Material,
-        settings: Settings,
-        kept: Collection[str],
-        advance: Callable[[], None],
+        self, material: Material, settings: Settings, kept: Collection[str], advance: Advance
     ) -> None:
         self._material, self._stated, self._kept = material, settings, kept
-        self._advance = advance
-        self._motion = driven(material.events)
-        is_surveyed = material.landmark_map is not None
-        self._open = opened(settings, kept, self._motion, is_surveyed)
+        self._advance, self._motion = advance, driven(material.events)
+        self._open = opened(settings, kept, self._motion, material.landmark_map is not None)
 
     def find(self, keeps_noise: bool = False) -> Found:
         """Return what is found; a UsageError says if there is too little to see."""
@@ -383,12 +378,23 @@ class CalibrationFinder:
         noise = []
         if not keeps_noise:
             likelihoods = [self._material.likelihood]
-            noise = search_noise(likelihoods, settings, of_points(settings), self._advance)
+            kinds = kinds_of(settings, of_motion=False)
+            noise = search_noise(likelihoods, settings, kinds, self._advance)
         settings = scaled(settings, [one.kind for one in noise], [one.log for one in noise])
         estimator, _ = self._run(settings)
         # A filter seems to know what only shows where it has linearised: a common scale.
         smoothed = estimator.smooth()
-        parts = [self._part(part, delay) for part in smoothed.calibration]
+        # Noise of the velocities makes their scales uncertain, too.
+        names = [entry.name for entry in OF_VELOCITY[:6]]
+        shares = dict(zip(names, self._motion.noise_share, strict=True))
+        parts = []
+        for part in smoothed.calibration:
+            if part.name == DELAY_NAME and delay is not None:
+                part = delay
+            elif '_scale_' in part.name:
+                uncertain = math.hypot(part.deviation, part.value * shares[part.name])
+                part = replace(part, deviation=min(uncertain, part.stated))
+            parts.append(part)
         return Found(
             parts,
             smoothed.calibration_correlations,
@@ -439,13 +445,11 @@ class CalibrationFinder:
         if not settings.velocity_delay_stddev:
             return None
         fixed = replace(settings, velocity_delay=0.0, velocity_delay_stddev=0.0)
-        known: dict[float, float] = {}
 
+        @cache
         def log_likelihood(delay_s: float) -> float:
-            if delay_s not in known:
-                self._advance()
-                known[delay_s] = delayed(self._material, delay_s).likelihood(fixed).total
-            return known[delay_s]
+            self._advance()
+            return delayed(self._material, delay_s).likelihood(fixed).total
 
         best_s, deviation_s = self._stated.velocity_delay, math.inf
         for step_s in DELAY_STEPS_S:
@@ -460,22 +464,8 @@ class CalibrationFinder:
             stated=prior_s,
         )
 
-    def _part(
-        self, part: CalibrationEstimate, delay: CalibrationEstimate | None
-    ) -> CalibrationEstimate:
-        """Return a part with all that is known to be uncertain of it."""
-        if part.name == DELAY_NAME and delay is not None:
-            return delay
-        if '_scale_' not in part.name:
-            return part
-        names = [entry.name for entry in OF_VELOCITY]
-        noise = part.value * self._motion.noise_share[names.index(part.name)]
-        return replace(part, deviation=min(math.hypot(part.deviation, noise), part.stated))
 
-
-def find_noise(
-    materials: Sequence[Material], settings: Settings, advance: Callable[[], None]
-) -> Found:
+def find_noise(materials: Sequence[Material], settings: Settings, advance: Advance) -> Found:
     """Return the noise of motion and points that recordings show together, and nothing else."""
     likelihoods = [material.likelihood for material in materials]
     noise = search_noise(likelihoods, settings, kinds_of(settings), advance)
@@ -523,8 +513,7 @@ def _maximum(
 _ROWS = {row.name: row for row in table(Settings)}
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseKind:
+class NoiseKind(NamedTuple):
     """A kind of error, and the parameters that say how large it is."""
 
     name: str
@@ -532,44 +521,28 @@ class NoiseKind:
 
 
 _OF_MOTION = (
-    NoiseKind('turning', ('angular_velocity_noise', 'angular_scale_noise')),
-    NoiseKind('driving', ('linear_velocity_noise', 'linear_scale_noise')),
+    ('turning', ('angular_velocity_noise', 'angular_scale_noise')),
+    ('driving', ('linear_velocity_noise', 'linear_scale_noise')),
 )
-_OF_POINTS = {
+_OF_POINTS: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
     'range_bearing': (
-        NoiseKind('range', ('range_noise', 'range_scale_noise')),
-        NoiseKind('bearing', ('bearing_noise',)),
+        ('range', ('range_noise', 'range_scale_noise')),
+        ('bearing', ('bearing_noise',)),
     ),
-    'fiducial': (NoiseKind('pixels', ('pixel_noise',)),),
-    'cartesian': (NoiseKind('points', ('point_noise',)),),
-    'stereo': (
-        NoiseKind('pixels', ('pixel_noise',)),
-        NoiseKind('disparity', ('disparity_noise',)),
-    ),
+    'fiducial': (('pixels', ('pixel_noise',)),),
+    'cartesian': (('points', ('point_noise',)),),
+    'stereo': (('pixels', ('pixel_noise',)), ('disparity', ('disparity_noise',))),
 }
 
 
-def kinds_of(settings: Settings) -> list[NoiseKind]:
+def kinds_of(
+    settings: Settings, of_motion: bool = True, of_points: bool = True
+) -> list[NoiseKind]:
     """Return the kinds of error that settings state, each with its figures that are not zero."""
-    return [*of_motion(settings), *of_points(settings)]
-
-
-def of_motion(settings: Settings) -> list[NoiseKind]:
-    """Return the noise parameters of velocities."""
-    return _stated(_OF_MOTION, settings)
-
-
-def of_points(settings: Settings) -> list[NoiseKind]:
-    """Return the noise parameters of points."""
-    return _stated(_OF_POINTS[settings.observation_model], settings)
-
-
-def _stated(possible: Sequence[NoiseKind], settings: Settings) -> list[NoiseKind]:
+    points = _OF_POINTS[settings.observation_model]
     kinds = [
-        NoiseKind(
-            kind.name, tuple(name for name in kind.parameters if np.any(getattr(settings, name)))
-        )
-        for kind in possible
+        NoiseKind(name, tuple(each for each in parameters if np.any(getattr(settings, each))))
+        for name, parameters in (*_OF_MOTION * of_motion, *points * of_points)
     ]
     return [kind for kind in kinds if kind.parameters]
 
@@ -687,22 +660,15 @@ def most_likely(objective: Objective, n: int) -> LikelyFactors:
 
 def remembered(objective: Callable[[Sequence[float]], float]) -> Objective:
     """Return a function that computes nothing twice."""
-    known: dict[tuple[float, ...], float] = {}
-
-    def value(x: FloatArray) -> float:
-        key = tuple(x.tolist())
-        if key not in known:
-            known[key] = objective(key)
-        return known[key]
-
-    return value
+    known = cache(objective)
+    return lambda x: known(tuple(x.tolist()))
 
 
 def search_noise(
     trained_on: Sequence[Callable[[Settings], Likelihood]],
     settings: Settings,
     kinds: Sequence[NoiseKind],
-    advance: Callable[[], None],
+    advance: Advance,
 ) -> list[NoiseFactor]:
     """Return the most likely factors of the kinds of noise that have an effect.
 

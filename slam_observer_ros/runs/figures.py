@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 
-from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.errors import EvaluationError, failing
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.se3 import rigid_alignment
@@ -28,29 +28,17 @@ PALE_BLUE = '#7FB8DA'
 
 # The dictionaries are Any: matplotlib's types list the settings of its own version only.
 STYLE: Any = {
-    'figure.constrained_layout.use': True,
-    'figure.dpi': 150,
-    'savefig.dpi': 'figure',
-    'font.size': 10,
-    'axes.titlesize': 11,
-    'axes.titleweight': 'bold',
-    'axes.titlelocation': 'left',
-    'axes.spines.top': False,
-    'axes.spines.right': False,
-    'axes.edgecolor': '#555555',
-    'axes.axisbelow': True,
-    'axes.grid': True,
-    'grid.color': '#DDDDDD',
-    'grid.linewidth': 0.6,
-    'lines.linewidth': 1.4,
-    'lines.solid_joinstyle': 'round',
-    'legend.frameon': False,
-    'legend.fontsize': 9,
+    'figure.constrained_layout.use': True, 'figure.dpi': 150, 'savefig.dpi': 'figure',
+    'font.size': 10, 'axes.titlesize': 11, 'axes.titleweight': 'bold',
+    'axes.titlelocation': 'left', 'axes.spines.top': False, 'axes.spines.right': False,
+    'axes.edgecolor': '#555555', 'axes.axisbelow': True, 'axes.grid': True,
+    'grid.color': '#DDDDDD', 'grid.linewidth': 0.6, 'lines.linewidth': 1.4,
+    'lines.solid_joinstyle': 'round', 'legend.frameon': False, 'legend.fontsize': 9,
     'agg.path.chunksize': 20_000,
     'pdf.fonttype': 42,  # publishers refuse matplotlib's default
     'svg.fonttype': 'none',  # text that can be searched and edited
     'svg.hashsalt': 'slam_observer_ros',  # the same figure is the same file
-}
+}  # fmt: skip
 
 SUFFIXES = ('png', 'svg', 'pdf')
 
@@ -106,10 +94,8 @@ def legend_below(figure: Figure, named: Axes, columns: int) -> None:
 def save(figure: Figure, path: Path) -> Path:
     """Write a file of one of SUFFIXES, return its path; raise an EvaluationError if that fails."""
     suffix = path.suffix.removeprefix('.')
-    try:
+    with failing(EvaluationError, f"can't write {path}"):
         figure.savefig(path, format=suffix, metadata=_NO_DATES[suffix])
-    except OSError as error:
-        raise EvaluationError(f"can't write {path}: {error.strerror}") from error
     return path
 
 
@@ -132,7 +118,7 @@ def plot_lyapunov(
     level: Any = {'color': PALE_BLUE, 'linewidth': 3.0}
     axes.plot(times_s, log10_lyapunov, **level, label=r'$\log_{10}\,\mathcal{L}$')
     if decay is not None and len(times_s) > 0:
-        line = decay.log10_at(times_s)
+        line = decay.log10_at_zero + decay.slope_per_s * times_s
         shown = line >= log10_lyapunov.min()
         label = f'fit after the transient, {decay.slope_per_s:.3f} per second'
         fit: Any = {'color': BLACK, 'linestyle': '--', 'linewidth': 1.2}
@@ -161,18 +147,9 @@ def plot_configuration(
     The correction is fitted to the final map and the second half of the path, where the
     transient is over. Flat scenes are drawn from above, others in three dimensions.
 
-    Parameters
-    ----------
-    path : Path
-        File to write, of one of the SUFFIXES.
-    estimate, truth : Trajectory
-        Poses at the same k stamps, k > 0.
-    landmark_tracks : FloatArray
-        (k, n, 3) landmark estimates at these stamps in the estimate's world, metres; NaN before
-        a landmark is first seen.
-    true_landmarks : FloatArray
-        (n, 3) true landmarks, metres.
-
+    The poses ``estimate`` and ``truth`` are at the same k > 0 stamps, and so are the
+    ``landmark_tracks`` (k, n, 3) in the estimate's world, metres, NaN before a landmark is
+    first seen. The ``true_landmarks`` are (n, 3), metres.
     """
     # The rigid correction
     second_half = slice(len(truth) // 2, None)
@@ -190,8 +167,17 @@ def plot_configuration(
 
     scene = np.concatenate([truth.positions, true_landmarks])
     flat = is_flat(scene)
-    figure = Figure(figsize=(7.2, 6.2) if flat else (7.2, _space_height_in(np.ptp(scene, axis=0))))
-    axes: Any = figure.add_subplot() if flat else _space_view(figure)
+    # A low scene in space needs little height.
+    spans_m = np.ptp(scene, axis=0)
+    space_height_in = 4.4 + 2.6 * float(spans_m[2] / max(spans_m.max(), 1e-30))
+    figure = Figure(figsize=(7.2, 6.2 if flat else space_height_in))
+    space: Any = {} if flat else {'projection': '3d', 'elev': 32.0, 'azim': -58.0}
+    axes: Any = figure.add_subplot(**space)  # of three dimensions they carry no types
+    if not flat:
+        axes.set_zlabel('z [m]', labelpad=-2.0)
+        axes.zaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.set_pane_color('white')
     for points, style in [
         (truth.positions, TRUE_PATH),
         (truth.positions[-1:], TRUE_END),
@@ -211,22 +197,6 @@ def plot_configuration(
         axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.25)
     legend_below(figure, axes, columns=4)
     return save(figure, path)
-
-
-def _space_height_in(spans_m: FloatArray) -> float:
-    """Return the height of a figure of a scene in space, inches: a low scene needs little."""
-    share = float(spans_m[2] / max(spans_m[:2].max(), spans_m[2]))
-    return 4.4 + 2.6 * share
-
-
-def _space_view(figure: Figure) -> Any:
-    # matplotlib's three-dimensional axes carry no types, hence Any.
-    axes: Any = figure.add_subplot(projection='3d', elev=32.0, azim=-58.0)
-    axes.set_zlabel('z [m]', labelpad=-2.0)
-    axes.zaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_pane_color('white')
-    return axes
 
 
 @mpl.rc_context(STYLE)

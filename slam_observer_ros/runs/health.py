@@ -309,13 +309,6 @@ def of_stamps(unstamped: Counter[str]) -> list[Finding]:
     return rule(count > 0, 'zero_stamps', topics=', '.join(unstamped), count=count)
 
 
-def of_map(counts: Counter[str], *, is_start_given: bool) -> list[Finding]:
-    """Judge whether a map that does not grow is the place's."""
-    share = point_share(counts, 'unmapped_landmark')
-    start = ', and did the robot start where it was said to' if is_start_given else ''
-    return rule(share > MAX_UNMAPPED, 'unmapped_points', percent=100.0 * share, start=start)
-
-
 SILENT_S = 2.0
 """An input without messages for this long is a warning."""
 

@@ -161,10 +161,6 @@ class Decay:
     slope_per_s: float
     log10_at_zero: float
 
-    def log10_at(self, times_s: FloatArray) -> FloatArray:
-        """Return log10 L on the line at times (k,), seconds."""
-        return self.log10_at_zero + self.slope_per_s * times_s
-
 
 def fit_decay(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> Decay | None:
     """Fit a line to log10 L over time, after the transient and before rounding is felt.
@@ -217,18 +213,11 @@ class ConfigurationError:
     ) -> None:
         """Take in one configuration and the truth at that time, once after each observation.
 
-        Parameters
-        ----------
-        ids : IntArray
-            (n,) landmarks known so far; those without truth are passed over. One whose sensor
-            gave no id stands for the true landmark that it was nearest to most often when it was
-            seen; until then it is passed over, too. At other times drift puts it next to others.
-        covariance_of : callable, optional
-            Gives the joint covariance (m k, m k) of rows (m,) of the landmarks as seen by the
-            robot, of their first k coordinates, m²; None if it is not known.
-        seen_ids : IntArray, optional
-            Which of the landmarks were seen now; by default all.
-
+        Of the landmarks ``ids`` (n,) known so far those without truth are passed over. One whose
+        sensor gave no id stands for the true landmark that it was nearest to most often when it
+        was seen (by default now): at other times drift puts it next to others. ``covariance_of``
+        gives the joint covariance (m k, m k) of rows (m,) of the landmarks as seen by the robot,
+        of their first k coordinates, m², or None.
         """
         if not len(truth.ids):
             return
@@ -239,7 +228,9 @@ class ConfigurationError:
         without_id = is_automatic(ids)
         if np.count_nonzero(without_id):
             without_id &= np.isin(ids, ids if seen_ids is None else seen_ids)
-            self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
+            for landmark_id, point in zip(ids[without_id].tolist(), seen[without_id], strict=True):
+                nearest = np.argmin(np.linalg.norm(true_seen - point, axis=1))
+                self._votes[landmark_id][int(truth.ids[nearest])] += 1
         rows, true_rows = np.nonzero(self.true_ids(ids)[:, None] == truth.ids)
         if not len(rows):
             return
@@ -254,21 +245,10 @@ class ConfigurationError:
             if P is not None:
                 self.nees.append(_nees(errors[some], P))
 
-    def _vote(
-        self, ids: IntArray, seen: FloatArray, true_ids: IntArray, true_seen: FloatArray
-    ) -> None:
-        """Count for each landmark (n, 3) which true one (m, 3) is the nearest now."""
-        for landmark_id, point in zip(ids.tolist(), seen, strict=True):
-            nearest = np.argmin(np.linalg.norm(true_seen - point, axis=1))
-            self._votes[landmark_id][int(true_ids[nearest])] += 1
-
     def true_ids(self, ids: IntArray) -> IntArray:
         """Return the true landmark (n,) that each stands for; its own id where it had one."""
-        return np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
-
-    def _true_id(self, landmark_id: int) -> int:
-        votes = self._votes.get(landmark_id)
-        return landmark_id if votes is None else votes.most_common(1)[0][0]
+        most = {i: votes.most_common(1)[0][0] for i, votes in self._votes.items()}
+        return np.array([most.get(i, i) for i in ids.tolist()], dtype=np.int64)
 
     @property
     def anees(self) -> float | None:

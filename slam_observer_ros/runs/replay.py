@@ -93,7 +93,13 @@ def result_of(
             recorders += [notes] if request.keeps_run else [tally] if request.keeps_nis else []
             run = replay(events, settings, truth, maps or None, needs_poses, recorders)
             unused = list(of_use(recording, selected, inputs, run))
-            _check_used(request, unused)
+            needs_some = request.smooth or request.keeps_map or map_path is not None
+            for finding in unused:
+                if needs_some and finding.kind in ('no_observation', 'nothing_used'):
+                    raise UsageError(
+                        f'{finding.what}; --smooth, --map and --load-map need some: '
+                        f'{finding.remedy}'
+                    )
             if maps and not run.estimator.is_localised:
                 _check_localised(request, run, maps, look_for_mistakes)
             result = Result(
@@ -125,16 +131,6 @@ def result_of(
             map_frame,
         )
     return replace(result, judged=findings, smoothed=smoothed)
-
-
-def _check_used(request: Request, use: Sequence[Finding]) -> None:
-    """Raise a UsageError if no observation was used, and something that is asked for needs one."""
-    needs_some = request.smooth or request.keeps_map or request.load_map is not None
-    for finding in use:
-        if needs_some and finding.kind in ('no_observation', 'nothing_used'):
-            raise UsageError(
-                f'{finding.what}; --smooth, --map and --load-map need some: {finding.remedy}'
-            )
 
 
 def _check_localised(

@@ -128,46 +128,21 @@ class Request:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What came of a replay; since the last reset, if the clock jumped.
+    """What came of a replay; since the last reset, if the clock jumped."""
 
-    Attributes
-    ----------
-    estimator : Estimate
-        In its final state, with the map and the events dropped.
-    trajectory, pose_covariances : Trajectory, FloatArray or None
-        k poses of the online estimate, and (k, 6, 6) :attr:`.Estimator.pose_covariance` of each;
-        None without truth to compare their errors with.
-    dead_reckoning : Trajectory
-        What the velocities alone give, from the identity pose.
-    configuration : ConfigurationError
-        Gauge-free error after each observation; empty without truth.
-    seconds : float
-        CPU time of the estimator alone, without reading and measuring.
-    start_ns : int
-        Stamp of the first event that was used, nanoseconds; 0 if none was.
-    range_power : RangePower or None
-        How ranges grow with the cosine of the angle off the sensor's axis.
-    localised_ns : (int, int) or None
-        First and last stamp at which the pose in its final frame was known; None if it never was.
-    events, observations, angular_velocities : int
-        Events, dropped ones included; observations with points that were used; angular velocities
-        of an Imu that were taken in: all of them also before the last reset.
-
-    """
-
-    estimator: Estimate
-    trajectory: Trajectory
-    pose_covariances: FloatArray | None
-    dead_reckoning: Trajectory
-    configuration: ConfigurationError
-    events: int
-    seconds: float
+    estimator: Estimate  # in its final state, with the map and the events dropped
+    trajectory: Trajectory  # of the online estimate
+    pose_covariances: FloatArray | None  # (k, 6, 6) of its poses; None without truth to compare
+    dead_reckoning: Trajectory  # what the velocities alone give, from the identity pose
+    configuration: ConfigurationError  # after each observation; empty without truth
+    events: int  # dropped ones included; this and the last two also before the last reset
+    seconds: float  # CPU time of the estimator alone, without reading and measuring
     in_known_map: bool
-    start_ns: int
-    localised_ns: tuple[int, int] | None
-    range_power: RangePower | None
-    observations: int
-    angular_velocities: int
+    start_ns: int  # stamp of the first event that was used; 0 if none was
+    localised_ns: tuple[int, int] | None  # first and last stamp at which the final frame was known
+    range_power: RangePower | None  # how ranges grow with the cosine off the sensor's axis
+    observations: int  # with points that were used
+    angular_velocities: int  # of an Imu, that were taken in
 
     def seconds_until(self, stamp_ns: int) -> float:
         """Return the time from the first event to a stamp, seconds."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from slam_observer_ros.common.errors import significant
 from slam_observer_ros.common.findings import explained, Finding, found, Level, SUSPICIOUS
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.estimates import DELAY_NAME, Innovations, Reason
+from slam_observer_ros.estimates import DELAY_NAME, Innovations, point_share, Reason
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.recordings.decoding import input_decoders
@@ -27,15 +28,16 @@ from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import SelectedTopics
 from slam_observer_ros.recordings.trajectory import interpolate
 from slam_observer_ros.runs.health import (
+    MAX_UNMAPPED,
     of_all_learnt,
     of_estimate,
     of_fit,
     of_left_out,
-    of_map,
     of_map_without_ids,
     of_ranges,
     of_rejections,
     of_stamps,
+    rule,
 )
 from slam_observer_ros.runs.metrics import TrajectoryErrors
 from slam_observer_ros.runs.result import list_dropped, MALFORMED, Replay, Result
@@ -79,21 +81,22 @@ def _of_run(result: Result) -> Iterator[Finding]:
     # What ranges are taken for comes first: where that is wrong, noise makes up for it.
     yield from of_ranges(run.range_power, estimator.settings.range_is_depth)
     yield from of_estimate(estimator)
-    ambiguity = estimator.longest_ambiguity
+    ambiguity, times_s = estimator.longest_ambiguity, dict[str, Any]()
+    if ambiguity is not None:
+        bounds_ns = {'start_s': ambiguity.since_ns, 'end_s': ambiguity.until_ns}
+        times_s = {name: run.seconds_until(stamp_ns) for name, stamp_ns in bounds_ns.items()}
     for finding in of_map_without_ids(estimator, ambiguity):
-        if ambiguity is not None and finding.kind == 'ambiguous_map':
-            start_s, end_s = map(run.seconds_until, (ambiguity.since_ns, ambiguity.until_ns))
-            yield replace(finding, start_s=start_s, end_s=end_s)
-        else:
-            yield finding
+        yield replace(finding, **(times_s if finding.kind == 'ambiguous_map' else {}))
     yield from of_fit(None if result.nis is None else math.sqrt(result.nis))
-    if run.in_known_map and estimator.settings.localization_mode != 'off':
-        yield from of_map(counts, is_start_given=estimator.settings.set_initial_pose)
+    # Whether a map that does not grow is the place's.
+    share, settings = point_share(counts, 'unmapped_landmark'), estimator.settings
+    is_other = share > MAX_UNMAPPED and run.in_known_map and settings.localization_mode != 'off'
+    start = ', and did the robot start where it was said to' if settings.set_initial_pose else ''
+    yield from rule(is_other, 'unmapped_points', percent=100.0 * share, start=start)
     # These were logged when they happened.
     yield from of_left_out(counts, Level.NOTE)
     for name in UNEXPECTED_POSES:
-        if counts[name]:
-            yield replace(found(name), level=Level.NOTE)
+        yield from rule(counts[name] > 0, name, Level.NOTE)
 
 
 PLACE_THE_SENSOR = (
@@ -210,15 +213,15 @@ def of_timing(recording: Recording, selected: SelectedTopics) -> Iterator[Findin
         if topic not in inputs:
             continue
         silence_s = inputs[topic].silence_s(start_s, end_s)
-        if silence_s > MAX_SILENCE * duration_s:
-            yield found(
-                'silence',
-                input=input_name,
-                topic=topic,
-                silence_s=silence_s,
-                duration_s=duration_s,
-                consequence=consequence,
-            )
+        yield from rule(
+            silence_s > MAX_SILENCE * duration_s,
+            'silence',
+            input=input_name,
+            topic=topic,
+            silence_s=silence_s,
+            duration_s=duration_s,
+            consequence=consequence,
+        )
     if landmarks in inputs and len(inputs[landmarks]) >= FEWEST:
         last_s = inputs[landmarks].last_s
         silence_s = end_s - last_s
@@ -239,18 +242,15 @@ def of_clocks(recording: Recording, selected: SelectedTopics) -> Iterator[Findin
         yield found('stamps_of_1970', topics=' and '.join(of_1970))
         return
     names = list(inputs)
-    for name in names[:1]:
-        if inputs[name].ahead_s > MAX_AHEAD_S:
-            yield found('early_stamps', topic=name, ahead_s=inputs[name].ahead_s)
-    for name in names[1:]:
-        arrivals, first_name, first = inputs[name], names[0], inputs[names[0]]
-        behind_s = arrivals.behind_s(first)
-        is_early = min(arrivals.ahead_s, -behind_s) > MAX_AHEAD_S
-        if is_early or abs(behind_s) > MAX_CLOCK_OFFSET_S:
-            side = 'behind' if behind_s > 0.0 else 'ahead of'
-            yield found(
-                'other_clock', topic=name, offset_s=abs(behind_s), side=side, other=first_name
-            )
+    for name in names:
+        other, ahead_s = names[0], inputs[name].ahead_s
+        if name == other:
+            yield from rule(ahead_s > MAX_AHEAD_S, 'early_stamps', topic=name, ahead_s=ahead_s)
+            continue
+        behind_s = inputs[name].behind_s(inputs[other])
+        is_off = min(ahead_s, -behind_s) > MAX_AHEAD_S or abs(behind_s) > MAX_CLOCK_OFFSET_S
+        side, off_s = 'behind' if behind_s > 0.0 else 'ahead of', abs(behind_s)
+        yield from rule(is_off, 'other_clock', topic=name, offset_s=off_s, side=side, other=other)
 
 
 MAX_GROWTHS = 3
@@ -280,16 +280,23 @@ MIN_DEGREES = 60
 
 def of_errors(result: Result) -> Iterator[Finding]:
     """Judge where the error grew, and which noise explains less than what is seen."""
-    yield from _of_growth(result)
-    if result.accuracy.anees is not None and result.accuracy.anees > MAX_ANEES:
-        yield found(
-            'overconfident_pose',
-            factor=np.sqrt(result.accuracy.anees),
-            anees=result.accuracy.anees,
-        )
+    if result.errors is not None:
+        yield from _of_growth(result, result.errors)
+    anees = result.accuracy.anees or 0.0
+    is_overconfident = anees > MAX_ANEES
+    yield from rule(is_overconfident, 'overconfident_pose', factor=np.sqrt(anees), anees=anees)
     if result.errors is not None:
         yield from _of_axes(result)
-    yield from _of_gaps(result.innovations)
+    # Innovations after a time without landmarks, and the others
+    innovations = result.innovations
+    since_s = np.diff(to_s(innovations.update_stamps_ns), prepend=np.nan)
+    of_points = _ratio(innovations, since_s <= LONG_S)
+    of_motion = _ratio(innovations, since_s > LONG_S)
+    ratios = significant(of_points, 2), significant(of_motion, 2)
+    yield from rule(of_points > TOO_LITTLE, 'point_noise', ratio=ratios[0])
+    # What points explain is part of all innovations.
+    is_motion = of_motion > TOO_LITTLE * max(of_points, 1.0)
+    yield from rule(is_motion, 'motion_noise', gap_s=LONG_S, ratio=ratios[1])
 
 
 def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int, int]]:
@@ -314,26 +321,14 @@ def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int,
     ]
 
 
-def _of_growth(result: Result) -> list[Finding]:
-    if result.errors is None:
-        return []
-    seconds = result.seconds(result.errors.estimate.stamps_ns)
-    errors_m = np.linalg.norm(result.errors.errors[:, 3:], axis=1)
-    return [
-        replace(
-            found(
-                'error_growth',
-                before_m=errors_m[start],
-                after_m=errors_m[end],
-                start_s=seconds[start],
-                end_s=seconds[end],
-                circumstances=_circumstances(result, result.errors, start, end),
-            ),
-            start_s=float(seconds[start]),
-            end_s=float(seconds[end]),
-        )
-        for start, end in growth_windows(seconds, errors_m)
-    ]
+def _of_growth(result: Result, errors: TrajectoryErrors) -> Iterator[Finding]:
+    seconds, errors_m = result.seconds(errors.estimate.stamps_ns), errors.distances_m
+    for start, end in growth_windows(seconds, errors_m):
+        times_s: dict[str, Any] = {'start_s': float(seconds[start]), 'end_s': float(seconds[end])}
+        bounds_m = {'before_m': errors_m[start], 'after_m': errors_m[end]}
+        circumstances = _circumstances(result, errors, start, end)
+        finding = found('error_growth', circumstances=circumstances, **bounds_m, **times_s)
+        yield replace(finding, **times_s)
 
 
 def _circumstances(result: Result, errors: TrajectoryErrors, start: int, end: int) -> str:
@@ -401,27 +396,10 @@ def _of_axes(result: Result) -> Iterator[Finding]:
         fit, *_ = np.linalg.lstsq(design, errors[:, axis], rcond=None)
         left, mean = errors[:, axis] - design @ fit, stated[:, axis].mean()
         ratio = math.sqrt(np.mean(left**2) / mean) if mean > 0.0 else 0.0
-        if ratio > TOO_LITTLE:
-            kind, motion = ('angular', 'turns') if axis < 3 else ('linear', 'ways')
-            yield found(
-                'axis_noise',
-                turn_or_way=kind,
-                axis='xyz'[axis % 3],
-                ratio=significant(ratio, 2),
-                motion=motion,
-            )
-
-
-def _of_gaps(innovations: Innovations) -> Iterator[Finding]:
-    """Judge the innovations after a time without landmarks, and the others."""
-    since_s = np.diff(to_s(innovations.update_stamps_ns), prepend=np.nan)
-    of_points = _ratio(innovations, since_s <= LONG_S)
-    of_motion = _ratio(innovations, since_s > LONG_S)
-    if of_points > TOO_LITTLE:
-        yield found('point_noise', ratio=significant(of_points, 2))
-    # What points explain is part of all innovations.
-    if of_motion > TOO_LITTLE * max(of_points, 1.0):
-        yield found('motion_noise', gap_s=LONG_S, ratio=significant(of_motion, 2))
+        turn_or_way, motion = ('angular', 'turns') if axis < 3 else ('linear', 'ways')
+        words: dict[str, Any] = {'turn_or_way': turn_or_way, 'motion': motion}
+        words |= {'ratio': significant(ratio, 2)}
+        yield from rule(ratio > TOO_LITTLE, 'axis_noise', axis='xyz'[axis % 3], **words)
 
 
 def _ratio(innovations: Innovations, is_chosen: BoolArray) -> float:

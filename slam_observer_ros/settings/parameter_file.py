@@ -8,7 +8,7 @@ from pathlib import Path
 import re
 import textwrap
 
-from slam_observer_ros.common.errors import OutputError, ParameterError, shown, YamlError
+from slam_observer_ros.common.errors import failing, OutputError, ParameterError, shown, YamlError
 from slam_observer_ros.common.files import load_yaml, plain_value, unfinished_file
 from slam_observer_ros.settings.parameter_table import (
     Parameter,
@@ -232,11 +232,8 @@ def write_found(
     for comment, values in found:
         lines += ['', *(f'    # {line}' for line in comment.splitlines())]
         lines += [_entry(name, value) for name, value in values.items()]
-    try:
-        with unfinished_file(path) as file:
-            file.write('\n'.join(lines) + '\n')
-    except OSError as error:
-        raise OutputError(f"can't write {path}: {error.strerror}") from error
+    with failing(OutputError, f"can't write {path}"), unfinished_file(path) as file:
+        file.write('\n'.join(lines) + '\n')
 
 
 def _entry(name: str, value: object) -> str:
