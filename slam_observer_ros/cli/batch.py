@@ -408,8 +408,7 @@ def opened_log(path: Path) -> Iterator[Callable[[Mapping[str, object]], None]]:
 
 def write_failures(path: Path, failures: Iterable[Mapping[str, object]]) -> None:
     """Write the runs that failed, a line each; without any there is no such file."""
-    lines = [json_text(failure) + '\n' for failure in failures]
-    if not lines:
+    if not (lines := [json_text(failure) + '\n' for failure in failures]):
         path.unlink(missing_ok=True)
         return
     with unfinished_file(path) as file:
@@ -449,16 +448,12 @@ def _fault_of(line: object) -> str:
     if not all(isinstance(warning, str) for warning in line['warnings']):
         return 'a warning is no text'
     for name in FIGURES:
-        if not (line.get(name) is None or _is_finite(line[name])):
+        value = line.get(name)
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if value is not None and not (is_number and abs(value) <= sys.float_info.max):
             return f"'{name}' is no number"
     wrong = [kind for kind in FILES if not isinstance(line.get(kind), str | None)]
     return f"'{wrong[0]}' is no file" if wrong else ''
-
-
-def _is_finite(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return -sys.float_info.max <= value <= sys.float_info.max
 
 
 CONNECT_S = 10.0

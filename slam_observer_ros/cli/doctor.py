@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import metadata
 from importlib.util import find_spec
 from itertools import islice
@@ -21,7 +22,6 @@ from slam_observer_ros.cli.options import find_config, options
 from slam_observer_ros.common import __version__
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import explained, Finding
-from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AZIMUTH_RANGE,
@@ -105,18 +105,12 @@ def run(args: argparse.Namespace) -> None:
             findings += of_anchors(shipped_settings(name), events, maps)
         findings = explained([*findings, *rivals])
         if args.json:
-            print_json(
-                {
-                    'recording': str(args.recording),
-                    'config': name,
-                    'why': why,
-                    'findings': [finding.as_json() for finding in findings],
-                }
-            )
+            listed = {'findings': [finding.as_json() for finding in findings]}
+            print_json({'recording': str(args.recording), 'config': name, 'why': why, **listed})
             return
-        rows = {'fits': f'--config {name}', 'because': why}
         named = ', or '.join(f'{finding.what}: {finding.remedy}' for finding in findings)
-        rows['mistakes of the set-up'] = named or 'none found'
+        rows = {'fits': f'--config {name}', 'because': why}
+        rows |= {'mistakes of the set-up': named or 'none found'}
         print_table(str(args.recording), rows)
         return
     installed = _installed()
@@ -147,19 +141,17 @@ def _installed() -> dict[str, str]:
         'ROS': ros,
         'step of the filter': core.description(),
     }
-    packages = {'tf2_msgs': 'poses of sensors on /tf'}  # of messages, that may be missing
+    uses = {'tf2_msgs': 'poses of sensors on /tf'}  # of messages, that may be missing
     for known in (*message_types('velocity').values(), *message_types('landmarks').values()):
-        package = known.name.partition('/')[0]
+        uses[known.name.partition('/')[0]] = known.short_name
+    for package, use in uses.items():
         if package not in COMMON_PACKAGES:
-            packages[package] = known.short_name
-    for package, use in packages.items():
-        is_there = find_spec(package) is not None
-        found[package] = 'installed' if is_there else f'not installed; it is for {use}'
+            is_there = find_spec(package) is not None
+            found[package] = 'installed' if is_there else f'not installed; it is for {use}'
     for package, use in OPTIONAL_PACKAGES.items():
-        try:
+        found[package] = f'not installed; it is for {use}'
+        with suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = f'not installed; it is for {use}'
     return found
 
 
@@ -215,9 +207,7 @@ def of_anchors(
         estimator.add(event)
     estimator.flush()
     problem = estimator.localisation_problem
-    if problem is not None:
-        return [problem]
-    return of_half_points(estimator.anchor_biases, [])
+    return [problem] if problem is not None else of_half_points(estimator.anchor_biases, [])
 
 
 def fitting_file(kind: str, events: Sequence[Event]) -> tuple[str, str]:
@@ -249,7 +239,9 @@ def fitting_file(kind: str, events: Sequence[Event]) -> tuple[str, str]:
             'reflectors',
             f'points have no ids, are few, and further away than a camera reads tags; {where}',
         )
-    if _are_commands(velocities):
+    moving = velocities[velocities.any(axis=1)]
+    is_repeated = (moving[1:] == moving[:-1]).all(axis=1)
+    if len(is_repeated) and np.mean(is_repeated) > REPEATED:
         return (
             'wheeled_bearing_range',
             f'{where}, and its velocities are commands: most are exactly the one before',
@@ -273,10 +265,3 @@ def _are_reflectors(seen: list[ObservationEvent]) -> bool:
     ranges_m = np.concatenate([np.linalg.norm(e.lines_of_sight, axis=1) for e in seen])
     are_few = np.median([len(e.ids) for e in seen]) <= FEW
     return bool(are_few and np.mean(ranges_m > FAR_M) > FAR_SHARE)
-
-
-def _are_commands(velocities: FloatArray) -> bool:
-    moving = velocities[velocities.any(axis=1)]
-    if len(moving) < 2:
-        return False
-    return bool(np.mean((moving[1:] == moving[:-1]).all(axis=1)) > REPEATED)

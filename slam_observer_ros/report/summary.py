@@ -137,25 +137,19 @@ def summary_rows(result: Result) -> dict[str, str]:
         rows['pose in the map'] = found + lost_again
     rows |= {part.name: str(part) for part in estimator.calibration}
     rows |= {f'noise of {part.name}': str(part) for part in estimator.motion_factors}
-    return rows | _accuracy_rows(result)
-
-
-def _accuracy_rows(result: Result) -> dict[str, str]:
-    figures, rows = as_json(result), {}
+    # Accuracy
+    figures, accuracy = as_json(result), {}
     if figures['unsmoothed_ate_rmse_m'] == figures['ate_rmse_m']:  # all of it is smoothed
         figures['unsmoothed_ate_rmse_m'] = None
     share = figures['truth_covered']
     if isinstance(share, float) and share <= NEARLY_ALL:
-        rows['truth'] = f'covers {100.0 * share:.1f} % of the trajectory'
+        accuracy['truth'] = f'covers {100.0 * share:.1f} % of the trajectory'
     for key, (name, unit) in ACCURACY_ROWS.items():
         figure = figures[key]
         if isinstance(figure, float):
             number = math.degrees(figure) if key.endswith('_rad') else figure
-            rows[name] = f'{significant(number)} {unit}'
-    if rows:
-        return rows
+            accuracy[name] = f'{significant(number)} {unit}'
     has_truth = len(result.truth.stamps_ns) > 0 or result.truth.landmarks is not None
-    why = 'the recording holds no truth to compare with'
-    if has_truth:
-        why = 'the truth fits nothing estimated'
-    return {'accuracy': f'not known: {why}'}
+    why = 'the truth fits nothing estimated'
+    why = why if has_truth else 'the recording holds no truth to compare with'
+    return rows | (accuracy or {'accuracy': f'not known: {why}'})
