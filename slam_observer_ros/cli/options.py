@@ -306,8 +306,8 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         parser,
         """
         --load-map FILE: known landmarks, as --map writes them, or a folder of such maps, one of
-            them that of the place: the estimate is then in their frame, and has no ANEES of the
-            pose (nor of the configuration, if they are fixed)
+            them the map of the place: the estimate is then in their frame, and has no ANEES of
+            the pose (nor of the configuration, if they are fixed)
         --smooth: estimate trajectory and map from all observations together, too; --tum and --map
             then write these
         """,
