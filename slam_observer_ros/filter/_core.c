@@ -2,14 +2,15 @@
  *
  * advance() moves a state along velocities (27), observe() by the innovation (28)-(31), both on
  * the arrays of flat_arrays.py. UNUSUAL comes back before anything is changed, for a gap in the
- * velocities and where rounding has left no digits: Python goes on over the same arrays. What the equations mean, and the units, step.py says; a
- * change is made in both, and test/filter/test_core.py holds each step of either to the other.
+ * velocities, landmarks that move, and where rounding has left no digits: Python goes on over the
+ * same arrays. step.py says what the equations mean, and the units; a change is made in both, and
+ * test/filter/test_core.py holds each step of either to the other.
  *
  * All that could be read or written beyond an array's end is checked when the arrays come in, in
  * the functions named read_...; nothing is checked after them. Nothing is kept from call to call.
  */
 #include "_door.h" /* first, as it includes Python.h */
-#include "_linear.h"
+#include "_se3.h"
 
 enum { UNUSUAL = -1, AT_REST = 0, DONE = 1, REJECTS = 2 };
 
@@ -271,15 +272,15 @@ static void only_counting(double V[6], int is_planar) {
         V[0] = V[1] = V[5] = 0.0;
 }
 
-static int moves(const double V[6]) {
-    for (int j = 0; j < 6; j++)
-        if (V[j] != 0.0)
-            return 1;
-    return 0;
+static int is_zero(const double *v, int n) {
+    for (int j = 0; j < n; j++)
+        if (v[j] != 0.0)
+            return 0;
+    return 1;
 }
 
 static void calibrated(const FilterState *x, const double V[6], double out[6]) { /* M V + b */
-    int is_moving = moves(V);
+    int is_moving = !is_zero(V, 6);
     for (int i = 0; i < 6; i++) {
         const double *row = x->rates + 7 * i;
         out[i] = 0.0;
@@ -309,42 +310,29 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
             memcpy(piece->stated, v->covariances + 36 * row, sizeof piece->stated);
         memcpy(piece->V, v->V + 6 * row, sizeof piece->V);
         only_counting(piece->V, is_planar);
-        piece->moves = moves(piece->V);
+        piece->moves = !is_zero(piece->V, 6);
     }
     return 1;
 }
 
-static void sum_up(Piece *pieces, long k) {
-    double until_s = 0.0, moved[6] = {0.0};
-    for (long i = 0; i < k; i++) {
-        pieces[i].until_s = until_s += pieces[i].dt_s;
-        for (int j = 0; j < 6; j++)
-            pieces[i].moved[j] = moved[j] += pieces[i].dt_s * pieces[i].V[j];
-    }
-}
-
-static double time_at(const Piece *pieces, long pose) {
-    return pose ? pieces[pose - 1].until_s : 0.0;
-}
-
-static double moved_at(const Piece *pieces, long pose, int axis) {
-    return pose ? pieces[pose - 1].moved[axis] : 0.0;
-}
-
 /* Noise in proportion to the mean velocity over a window around the middle of each piece. */
 static void add_scale_noise(Piece *pieces, long k, const double scales[6]) {
-    sum_up(pieces, k);
-    long first = 0, last = 0;
+    for (long i = 0; i < k; i++) { /* sums until each, of which the first follows one of nothing */
+        pieces[i].until_s = pieces[i - 1].until_s + pieces[i].dt_s;
+        for (int j = 0; j < 6; j++)
+            pieces[i].moved[j] = pieces[i - 1].moved[j] + pieces[i].dt_s * pieces[i].V[j];
+    }
+    long first = -1, last = -1; /* the window is behind the first, and ends with the last */
     for (long i = 0; i < k; i++) {
-        double middle_s = 0.5 * (time_at(pieces, i) + time_at(pieces, i + 1));
-        while (first < i && time_at(pieces, first) < middle_s - 0.5 * SPEED_WINDOW_S)
+        double middle_s = 0.5 * (pieces[i - 1].until_s + pieces[i].until_s);
+        while (first < i - 1 && pieces[first].until_s < middle_s - 0.5 * SPEED_WINDOW_S)
             first++;
-        while (last < k && time_at(pieces, last + 1) <= middle_s + 0.5 * SPEED_WINDOW_S)
+        while (last < k - 1 && pieces[last + 1].until_s <= middle_s + 0.5 * SPEED_WINDOW_S)
             last++;
-        long end = last > i ? last : i + 1;
-        double length_s = larger(time_at(pieces, end) - time_at(pieces, first), TINY);
+        const Piece *begin = &pieces[first], *end = &pieces[last > i ? last : i];
+        double length_s = larger(end->until_s - begin->until_s, TINY);
         for (int j = 0; j < 6; j++) {
-            double mean = (moved_at(pieces, end, j) - moved_at(pieces, first, j)) / length_s;
+            double mean = (end->moved[j] - begin->moved[j]) / length_s;
             pieces[i].Q[j] += scales[j] * mean * (scales[j] * mean) * pieces[i].dt_s;
         }
     }
@@ -370,7 +358,7 @@ static void fill_variances(Piece *pieces, long k, const Velocities *v, const Int
                            const MotionFigures *figures) {
     double ahead_s = interval->delay_ns < 0 ? (double)-interval->delay_ns / 1e9 : 0.0;
     double usual_s[2] = {v->usual_s[0] + ahead_s, v->usual_s[1] + ahead_s};
-    int some_last = 0, has_scale = 0;
+    int some_last = 0;
     for (long i = 0; i < k; i++)
         for (int s = 0; s < 2; s++)
             some_last |= pieces[i].before_s[s] + pieces[i].dt_s > usual_s[s];
@@ -383,16 +371,14 @@ static void fill_variances(Piece *pieces, long k, const Velocities *v, const Int
                           - before_s * larger(before_s / usual_s[j / 3], 1.0);
             pieces[i].Q[j] = figures->densities[j] * white_s;
         }
-    for (int j = 0; j < 6; j++)
-        has_scale |= figures->scales[j] != 0.0;
-    if (has_scale)
+    if (!is_zero(figures->scales, 6))
         add_scale_noise(pieces, k, figures->scales);
-    for (long i = 0; i < k; i++)
+    for (long i = 0; i < k; i++) {
         for (int j = 0; j < 6; j++)
             pieces[i].Q[j] *= figures->factors[j / 3];
-    for (long i = 0; i < k; i++)
         if (pieces[i].is_stated[0] || pieces[i].is_stated[1])
             fill_stated(&pieces[i], figures->factors);
+    }
 }
 
 static const double *stated_of(const Piece *piece) { /* NULL where nothing is stated */
@@ -401,7 +387,7 @@ static const double *stated_of(const Piece *piece) { /* NULL where nothing is st
 
 /* Add Ad Q Ad' of what is stated: half of the pieces before and after a pose, either of which may
  * be NULL. What turning and driving share is half theirs. */
-static void add_stated(int p, const double Ad[36], const double *before, const double *after,
+static void add_stated(int p, const double *Ad, const double *before, const double *after,
                        const Advanced *out) {
     for (int i = 0; i < 6; i++)
         for (int j = 0; j < 6; j++) {
@@ -416,22 +402,9 @@ static void add_stated(int p, const double Ad[36], const double *before, const d
         }
 }
 
-/* The estimated rows of Ad = [[R, 0], [hat(x) R, R]], (p, 6). */
-static void adjoint_rows(const FilterState *x, const Pose *pose, double Ad[36]) {
-    double K[9], KR[9];
-    hat(pose->x, K);
-    times(K, pose->R, KR);
-    for (int s = 0; s < x->p; s++)
-        for (int j = 0; j < 3; j++) {
-            int row = x->pose + s;
-            Ad[6 * s + j] = row < 3 ? pose->R[3 * row + j] : KR[3 * (row - 3) + j];
-            Ad[6 * s + 3 + j] = row < 3 ? 0.0 : pose->R[3 * (row - 3) + j];
-        }
-}
-
 /* Add Ad Q Ad' and how the calibration turns, of what belongs to one pose by the trapezoidal rule:
  * halves of the pieces before and after it, either of which may be missing. */
-static void add_at_pose(const FilterState *x, const double Ad[36], const Piece *before,
+static void add_at_pose(const FilterState *x, const double *Ad, const Piece *before,
                         const Piece *after, const Advanced *out) {
     int p = x->p;
     double Q[6] = {0.0};
@@ -480,13 +453,9 @@ static int mean_about(i64 stamp_ns, const Velocities *v, const Interval *interva
         i64 ends_ns = row + 1 < last ? v->stamps_ns[row + 1] : end_ns;
         if (!is_stamp(begins_ns) || !is_stamp(ends_ns) || !is_stamp(since_ns))
             return 0;
-        if (begins_ns < start_ns)
-            begins_ns = start_ns;
+        begins_ns = begins_ns < start_ns ? start_ns : begins_ns;
         i64 stops_ns = since_ns + v->timeout_ns;
-        if (stops_ns < begins_ns)
-            stops_ns = begins_ns;
-        if (stops_ns > ends_ns)
-            stops_ns = ends_ns;
+        stops_ns = stops_ns > ends_ns ? ends_ns : stops_ns < begins_ns ? begins_ns : stops_ns;
         double held_s = seconds(stops_ns, begins_ns);
         known_s += held_s;
         for (int j = 0; j < 6; j++)
@@ -499,7 +468,7 @@ static int mean_about(i64 stamp_ns, const Velocities *v, const Interval *interva
 }
 
 /* Of a delay, F is what the velocity at its two ends differs by. */
-static void fill_delay(const FilterState *x, const double first[36], const double last[36],
+static void fill_delay(const FilterState *x, const double *first, const double *last,
                        const double at_start[6], const double at_end[6], double *F) {
     double before[6], after[6];
     calibrated(x, at_start, before);
@@ -512,7 +481,7 @@ static void fill_delay(const FilterState *x, const double first[36], const doubl
     }
 }
 
-/* (27)  A <- A exp(V dt) along the pieces, with noise, F and the rows of Ad at both ends. */
+/* (27)  A <- A exp(V dt) along the pieces, with noise, F and Ad at both ends. */
 static void follow_path(const FilterState *x, const Piece *pieces, long k, const Advanced *out,
                         double first[36], double last[36]) {
     int p = x->p;
@@ -522,23 +491,18 @@ static void follow_path(const FilterState *x, const Piece *pieces, long k, const
     memset(out->F, 0, (size_t)(p * x->c) * sizeof(double));
     for (long i = 0; i <= k; i++) {
         const Piece *before = i > 0 ? &pieces[i - 1] : NULL, *after = i < k ? &pieces[i] : NULL;
-        adjoint_rows(x, &pose, last);
+        adjoint(&pose, last);
         if (i == 0)
             memcpy(first, last, 36 * sizeof(double));
-        add_at_pose(x, last, before, after, out);
+        add_at_pose(x, last + 6 * x->pose, before, after, out);
         if (after == NULL)
             break;
-        double twist[6], E[9], J[9], shift[3], moved[3], R[9];
+        double twist[6];
         calibrated(x, after->V, twist);
         for (int j = 0; j < 6; j++)
             twist[j] *= after->dt_s;
-        exp_and_jacobian(twist, E, J);
-        turn(J, twist + 3, shift);
-        turn(pose.R, shift, moved);
-        times(pose.R, E, R);
-        memcpy(pose.R, R, sizeof R);
-        for (int j = 0; j < 3; j++)
-            pose.x[j] += moved[j];
+        Pose step = exponential(twist);
+        pose = composed(&pose, &step);
     }
     for (int s = 0; s < p; s++)
         for (int t = 0; t < s; t++) {
@@ -618,28 +582,28 @@ static int advance(const FilterState *x, const Velocities *v, const Interval *in
         if (!mean_about(interval->end_ns, v, interval, x->is_planar, at_end))
             return UNUSUAL;
     }
-    size_t pieces_size = (size_t)k * sizeof(Piece);
+    size_t pieces_size = (size_t)(k + 1) * sizeof(Piece);
     char *memory = PyMem_Malloc(pieces_size + (size_t)(2 * x->p * x->N) * sizeof(double));
     if (memory == NULL)
         return UNUSUAL;
-    Piece *pieces = (Piece *)memory;
+    Piece *pieces = (Piece *)memory + 1; /* behind one of nothing, at which sums begin */
+    memset(memory, 0, sizeof(Piece));
     int status = UNUSUAL;
     if (fill_pieces(v, first, last, start_ns, end_ns, x->is_planar, pieces)) {
-        status = AT_REST;
+        int some_move = 0, some_are_empty = 0;
         fill_variances(pieces, k, v, interval, figures);
         memset(out->variances, 0, 6 * sizeof(double));
         for (long i = 0; i < k; i++) {
-            status = pieces[i].moves ? DONE : status;
+            some_move |= pieces[i].moves, some_are_empty |= pieces[i].dt_s == 0.0;
             const double *stated = stated_of(&pieces[i]);
             for (int j = 0; j < 6; j++)
                 out->variances[j] += pieces[i].Q[j] + (stated ? stated[7 * j] : 0.0);
         }
-        for (long i = 0; i < k; i++)
-            status = pieces[i].dt_s == 0.0 ? AT_REST : status;
+        status = some_move && !some_are_empty ? DONE : AT_REST;
         follow_path(x, pieces, k, out, ad_first, ad_last);
         if (interval->reach_ns) {
             memcpy(out->at_end, at_end, sizeof at_end);
-            fill_delay(x, ad_first, ad_last, at_start, at_end, out->F);
+            fill_delay(x, ad_first + 6 * x->pose, ad_last + 6 * x->pose, at_start, at_end, out->F);
         }
         spread(x, out->noise, out->F, (double *)(memory + pieces_size));
         for (long q = 0; q < x->c; q++)
@@ -703,17 +667,10 @@ static void point_covariance(const double line[3], const PointFigures *figures, 
     add_to_diagonal(C, across + RESOLUTION_M * RESOLUTION_M + fmin(share, MOST_SHARE_M2));
 }
 
-static int is_zero(const double C[9]) {
-    for (int i = 0; i < 9; i++)
-        if (C[i] != 0.0)
-            return 0;
-    return 1;
-}
-
 /* That of a point y as stated, such that it can be inverted; by the figures if it is unknown. */
 static void stated_covariance(const double y[3], const double stated[9], const double line[3],
                               const PointFigures *figures, double C[9]) {
-    if (is_zero(stated)) {
+    if (is_zero(stated, 9)) {
         point_covariance(line, figures, C);
         return;
     }
@@ -757,18 +714,15 @@ static void calibrated_point(const Seen *seen, long i, const double turned[9], i
 /* D = R (-hat(l) J(psi), I, l) on k axes, of a point at l from the sensor. */
 static void fill_sensitivity(const FilterState *x, const Seen *seen, const double R_hat[9],
                              const double J[9], const double l[3], double *D) {
-    double K[9], of_turn[9], columns[7][3], turned[3];
+    double K[9], of_turn[9], column[3], turned[3];
     hat(l, K);
     times(K, J, of_turn);
-    for (int j = 0; j < 3; j++)
-        for (int b = 0; b < 3; b++) {
-            columns[j][b] = -of_turn[3 * b + j];
-            columns[3 + j][b] = b == j ? 1.0 : 0.0;
-        }
-    memcpy(columns[6], l, sizeof columns[6]);
     memset(D, 0, (size_t)(x->k * x->c) * sizeof(double));
     for (long j = 0; j < seen->c_s; j++) {
-        turn(R_hat, columns[seen->of_sensor[j]], turned);
+        int e = (int)seen->of_sensor[j];
+        for (int b = 0; b < 3; b++)
+            column[b] = e < 3 ? -of_turn[3 * b + e] : e < 6 ? (double)(e - 3 == b) : l[b];
+        turn(R_hat, column, turned);
         for (int b = 0; b < x->k; b++)
             D[b * x->c + seen->column + j] = turned[b];
     }
@@ -795,10 +749,11 @@ static int is_sure(const Landmarks *table, i64 row, i64 further, const Limits *l
     return count >= limits->confirmations && table->rejections[row] < needed - further;
 }
 
-/* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a stamp is none. */
+/* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a stamp is none. Of those that passed the gate
+ * if that has been judged, else of all, whose weights begin with 0. */
 static int fill_residuals(const FilterState *x, const Landmarks *table, const Seen *seen,
                           const PointFigures *figures, const Limits *limits, const Observed *out,
-                          Residuals *res) {
+                          int is_judged, Residuals *res) {
     Pose pose = pose_of(x->A);
     double turned[9] = {0.0}, J[9] = {0.0};
     int k = x->k;
@@ -812,9 +767,11 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
     for (long j = 0; j < seen->m; j++) {
         i64 row = seen->rows[j];
         double *y = out->points + 3 * j, *r = out->r + 3 * j, *origin = out->origins + 3 * j;
-        double *stated = res->stated + 9 * j, from_robot[3], expected[3], arm[3], line[3], C[9];
+        double *stated = res->stated + 9 * j, expected[3], arm[3], line[3], C[9];
         calibrated_point(seen, j, turned, x->is_planar, y, origin, stated);
-        out->weights[j] = 0.0, out->repeated[j] = 1.0;
+        if (is_judged && out->weights[j] == 0.0)
+            continue;
+        out->weights[j] = is_judged, out->repeated[j] = 1.0;
         memset(r, 0, 3 * sizeof(double));
         if (row < 0)
             continue;
@@ -825,9 +782,8 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
             double point = x->y_ref[3 * row + b] + x->a[3 * row + b];
             res->points[3 * i + b] = point;
             r[b] += pose.x[b] - point;
-            from_robot[b] = point - pose.x[b];
         }
-        turn_back(pose.R, from_robot, expected);
+        seen_from(&pose, res->points + 3 * i, expected);
         /* The noise at the range where a landmark should be, in the measured direction. */
         for (int b = 0; b < 3; b++) {
             arm[b] = y[b] - origin[b];
@@ -858,6 +814,7 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
         out->repeated[j] = res->repeated[i] = repetition_factor(dt_s, limits->error_time_s);
         res->rows[i] = row, res->at[i++] = j;
     }
+    res->m = i, res->M = k * i;
     return 1;
 }
 
@@ -965,40 +922,6 @@ static long judge(const FilterState *x, const Seen *seen, double gate, const Obs
         }
     }
     return passed;
-}
-
-/* Leave out the landmarks whose points have the weight 0. */
-static void select_passed(const FilterState *x, const Observed *out, Residuals *res) {
-    long used = 0, M = res->M, entries = 0;
-    int k = res->k;
-    for (long i = 0; i < M; i++) {
-        if (out->weights[res->at[i / k]] == 0.0)
-            continue;
-        long kept = 0; /* earlier entries are read before they are written over */
-        for (long j = 0; j < M; j++)
-            if (out->weights[res->at[j / k]] != 0.0) {
-                res->predicted[entries * M + kept] = res->predicted[i * M + j];
-                res->S[entries * M + kept++] = res->S[i * M + j];
-            }
-        entries++;
-    }
-    for (long i = 0; i < entries; i++) { /* rows of M entries become rows of so many */
-        memmove(res->predicted + i * entries, res->predicted + i * M,
-                (size_t)entries * sizeof(double));
-        memmove(res->S + i * entries, res->S + i * M, (size_t)entries * sizeof(double));
-    }
-    for (long i = 0; i < res->m; i++) {
-        if (out->weights[res->at[i]] == 0.0)
-            continue;
-        memmove(res->points + 3 * used, res->points + 3 * i, 3 * sizeof(double));
-        memmove(res->r + k * used, res->r + k * i, (size_t)k * sizeof(double));
-        memmove(res->R + k * k * used, res->R + k * k * i, (size_t)(k * k) * sizeof(double));
-        memmove(res->D + k * x->c * used, res->D + k * x->c * i,
-                (size_t)(k * x->c) * sizeof(double));
-        res->repeated[used] = res->repeated[i], res->rows[used] = res->rows[i];
-        res->at[used++] = res->at[i];
-    }
-    res->m = used, res->M = entries;
 }
 
 /* The density of each residual given those before it, and all together. */
@@ -1262,12 +1185,12 @@ static void record(const FilterState *x, const Landmarks *table, const Seen *see
             table->seen_before_ns[row] = table->last_seen_ns[row];
             table->last_seen_ns[row] = seen->stamp_ns;
         }
-        double from_robot[3], expected[3], *line = out->lines_of_sight + 3 * j;
+        double point[3], expected[3], *line = out->lines_of_sight + 3 * j;
         memcpy(expected, out->points + 3 * j, sizeof expected);
         if (row >= 0 && is_sure(table, row, !is_used, limits)) {
             for (int b = 0; b < 3; b++)
-                from_robot[b] = x->y_ref[3 * row + b] + x->a[3 * row + b] - pose.x[b];
-            turn_back(pose.R, from_robot, expected);
+                point[b] = x->y_ref[3 * row + b] + x->a[3 * row + b];
+            seen_from(&pose, point, expected);
         }
         for (int b = 0; b < 3; b++)
             line[b] = expected[b] - out->origins[3 * j + b];
@@ -1297,14 +1220,16 @@ static int observe(const FilterState *x, const Landmarks *table, const Seen *see
     i64 *at = (i64 *)(work + work_size); /* 8 bytes each, as numbers are */
     res.rows = at + 2 * M, res.at = res.rows + m;
     int status = UNUSUAL;
-    if (fill_residuals(x, table, seen, figures, limits, out, &res)) {
+    if (fill_residuals(x, table, seen, figures, limits, out, 0, &res)) {
         long passed = m ? judge(x, seen, limits->gate, out, &res) : 0;
         status = passed < 0 ? UNUSUAL : limits->may_refuse && 2 * passed < m ? REJECTS : DONE;
         if (status == DONE && m && factors->are_there
             && !learn(x, factors, limits->gate, &res, work, at, logs, information))
             status = UNUSUAL;
         if (status == DONE && passed < m) {
-            select_passed(x, out, &res);
+            fill_residuals(x, table, seen, figures, limits, out, 1, &res);
+            fill_predicted(x, &res);
+            with_noise(&res, res.predicted, NULL, NULL, res.S);
             status = solve(&res) ? DONE : UNUSUAL;
         }
         if (status == DONE && out->judges && res.m)

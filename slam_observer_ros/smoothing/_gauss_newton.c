@@ -685,17 +685,17 @@ static PyObject *py_linearise(PyObject *Py_UNUSED(self), PyObject *const *args, 
 }
 
 /* Both take equations and a chain; fill_in() the border's changes, and those of all poses, too. */
-static PyObject *solved(PyObject *const *args, Py_ssize_t count, int fills_in) {
+static PyObject *py_solve(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count) {
     Door door;
     Equations eq;
     Chain chain;
     Stretch stretch;
     double *border = NULL, *changes = NULL, *memory = NULL;
     long *integers = NULL;
-    int is_regular = 0;
+    int is_regular = 0, fills_in = count > 2;
     open_door(&door);
     if (count != (fills_in ? 4 : 2))
-        refuse(fills_in ? "fill_in" : "eliminate");
+        refuse("eliminate or fill_in");
     else if (read_equations(&door, args[0], &eq) && read_chain(&door, args[1], &eq, &chain)
              && (!fills_in || ((border = read_array(&door, args[2], "dw", "border")) != NULL
                                && (changes = read_array(&door, args[3], "DSd", "changes"))))) {
@@ -718,18 +718,10 @@ static PyObject *solved(PyObject *const *args, Py_ssize_t count, int fills_in) {
     return PyErr_Occurred() ? NULL : PyBool_FromLong(is_regular);
 }
 
-static PyObject *py_eliminate(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count) {
-    return solved(args, count, 0);
-}
-
-static PyObject *py_fill_in(PyObject *Py_UNUSED(self), PyObject *const *args, Py_ssize_t count) {
-    return solved(args, count, 1);
-}
-
 static PyMethodDef methods[] = {
     {"linearise", (PyCFunction)(void (*)(void))py_linearise, METH_FASTCALL, "Fill in equations."},
-    {"eliminate", (PyCFunction)(void (*)(void))py_eliminate, METH_FASTCALL, "Leave the border."},
-    {"fill_in", (PyCFunction)(void (*)(void))py_fill_in, METH_FASTCALL, "Find all changes."},
+    {"eliminate", (PyCFunction)(void (*)(void))py_solve, METH_FASTCALL, "Leave the border."},
+    {"fill_in", (PyCFunction)(void (*)(void))py_solve, METH_FASTCALL, "Find all changes."},
     {NULL, NULL, 0, NULL},
 };
 
