@@ -89,13 +89,13 @@ lock: $(READY_TO_DEVELOP)  ## write requirements*.lock, the hashes of what const
 $(READY): setup.py constraints.txt requirements.lock \
 		$(wildcard scripts/setup_venv.sh scripts/build_tf2_msgs.py)
 	scripts/setup_venv.sh $(VENV)
-	touch $@
+	touch $@ $(CORE)
 
 $(READY_TO_DEVELOP): $(READY) requirements-develop.lock
 	scripts/setup_venv.sh $(VENV) develop
 	touch $@
 
-# Where there is a compiler; it was built with the rest at first, and is again when it changes.
+# Where there is a compiler; it is built with the rest at first, and again when it changes.
 $(CORE): $(wildcard slam_observer_ros/*/_*.[ch]) | $(READY)
 	$(PYTHON_IN_VENV) setup.py --quiet build_ext --inplace
 	touch $@

@@ -25,7 +25,7 @@ create() {  # with options of python -m venv
 }
 
 install() {
-    "$venv/bin/python" -m pip install --quiet "$@"
+    "$venv/bin/python" -m pip install --quiet "$compile" "$@"
 }
 
 export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_WARN_SCRIPT_LOCATION=1
@@ -36,9 +36,10 @@ fi
 if [ "$purpose" = develop ]; then
     echo "adding what lint and tests need to $venv ..."
     extras=cli,test,dev lock=requirements-develop.lock
+    compile=--no-compile  # hardly anything of pandas and the like is imported
     create() { :; }
 else
-    extras=cli lock=requirements.lock
+    extras=cli lock=requirements.lock compile=--compile
 fi
 if [ -n "${ROS_DISTRO:-}" ]; then
     create --system-site-packages
@@ -51,7 +52,9 @@ create
 if [ "${ROS_WHEELS:-jazzy}" = jazzy ]; then
     # All that is needed, and nothing that is not what it was when `make lock` was run.
     install --no-deps --require-hashes --requirement "$lock"
-    install --no-deps --no-build-isolation --editable .
+    if [ "$purpose" = run ]; then
+        install --no-deps --no-build-isolation --editable .
+    fi
 else
     # The same versions, but for those of ROS itself.
     install --constraint <(grep -v '^ros-' constraints.txt) --editable ".[$extras,ros-$ROS_WHEELS]"

@@ -56,7 +56,7 @@ use_one_thread()
 
 # The same examples everywhere, so that a failure can be repeated by whoever reads of it; and no
 # deadline: no test may depend on how busy the machine is.
-settings.register_profile('suite', derandomize=True, deadline=None, max_examples=25)
+settings.register_profile('suite', derandomize=True, deadline=None, max_examples=15)
 settings.load_profile('suite')
 
 

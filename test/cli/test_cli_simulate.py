@@ -23,7 +23,7 @@ def test_by_default_log_lyapunov_falls_at_the_rate_of_the_paper(slam_observer):
     assert result['log10_lyapunov'][-1] < -14.0
 
 
-@pytest.mark.parametrize(('step_s', 'duration_s'), [(0.002, 4.0), (0.2, 80.0), (2.0, 80.0)])
+@pytest.mark.parametrize(('step_s', 'duration_s'), [(0.002, 4.0), (2.0, 80.0)])
 def test_the_rate_does_not_depend_on_the_step(slam_observer, step_s, duration_s):
     result = slam_observer.succeed(
         'simulate', '--json', '--step', step_s, '--duration', duration_s
@@ -87,11 +87,6 @@ def test_one_seed_one_run(slam_observer):
     assert first == again != other
 
 
-def test_summary_names_the_slope(slam_observer):
-    output = slam_observer.succeed('simulate', '--step', 0.1, '--duration', 40).output
-    assert '-0.217' in output
-
-
 def test_recording_converges_as_the_simulation_did(slam_observer, tmp_path):
     recording = tmp_path / 'run.mcap'
     slam_observer.succeed('simulate', '--step', 0.05, '--duration', 40, '--output', recording)
@@ -109,9 +104,10 @@ def short():
     return 'simulate', '--step', 0.1, '--duration', 2
 
 
-def test_figures(slam_observer, tmp_path):
+def test_the_summary_names_the_slope_and_figures_show_it(slam_observer, tmp_path):
     figures = tmp_path / 'figures'
-    slam_observer.succeed('simulate', '--step', 0.1, '--duration', 20, '--plot', figures)
+    ended = slam_observer.succeed('simulate', '--step', 0.1, '--duration', 20, '--plot', figures)
+    assert '-0.217' in ended.output
     assert {path.name for path in figures.iterdir()} == {'lyapunov.png', 'configuration.png'}
     for path in figures.iterdir():
         assert path.read_bytes().startswith(b'\x89PNG')

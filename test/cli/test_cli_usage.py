@@ -311,7 +311,7 @@ def test_reader_that_leaves_early():
 @pytest.mark.parametrize('json', [[], ['--json']])
 def test_closed_output(tmp_path, json):
     output = tmp_path / 'run.mcap'
-    command = [*COMMAND, 'simulate', '--duration', '10', '--output', str(output), *json]
+    command = [*COMMAND, 'simulate', '--duration', '1', '--output', str(output), *json]
     ended = subprocess.run(
         ['sh', '-c', 'exec "$@" >&-', 'sh', *command],
         cwd=CHECKOUT,

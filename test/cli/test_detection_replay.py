@@ -221,16 +221,25 @@ def recordings(tmp_path_factory):
     return {name: record(folder / name, *topics) for name, topics in chosen.items()}
 
 
+@pytest.fixture(scope='module')
+def estimates():
+    """Trajectories and maps, by recording and options."""
+    return {}
+
+
 @pytest.fixture
-def estimate(slam_observer, tmp_path):
-    """Replay a recording; return the trajectory and the map."""
+def estimate(slam_observer, estimates, tmp_path):
+    """Replay a recording, once with the same options; return the trajectory and the map."""
 
     def run(path, *options):
+        if (path, options) in estimates:
+            return estimates[path, options]
         files = tmp_path / 'poses.tum', tmp_path / 'map.yaml'
         outputs = ('--tum', files[0], '--map', files[1], '--force', '--json')
         report = slam_observer.succeed('replay', path, *outputs, *options).json
         assert not report['dropped']
-        return read_tum(files[0]), read_map(files[1])
+        estimates[path, options] = read_tum(files[0]), read_map(files[1])
+        return estimates[path, options]
 
     return run
 

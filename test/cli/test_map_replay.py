@@ -204,7 +204,7 @@ class TestPoseInMapNotKnown:
         self, slam_observer, tmp_path, saved, more
     ):
         other = record(
-            tmp_path / 'other.mcap', np.eye(4), 2, lambda s: 100, scale=lambda s: 1.5, steps=20
+            tmp_path / 'other.mcap', np.eye(4), 2, lambda s: 100, scale=lambda s: 1.5, steps=8
         )
         poses, page, before = tmp_path / 'poses.tum', tmp_path / 'run.html', saved.read_bytes()
         error = slam_observer.fail(
@@ -312,14 +312,14 @@ def test_smoothing_says_what_cut_the_history_short(slam_observer, tmp_path):
     assert 'smoothing_window' not in jumped.errors + loaded.errors
 
 
-@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+@pytest.mark.parametrize('mode', ['off', 'fixed'])
 def test_points_of_no_landmark_of_a_map_that_does_not_grow_are_reported(
     slam_observer, tmp_path, mode
 ):
     """The map is of some twenty landmarks, whose ids are shared; of others they go up from 100."""
     first = record(tmp_path / 'first.mcap', np.eye(4), seed=1)
     others = record(
-        tmp_path / 'second.mcap', np.eye(4), 2, lambda s: 0 if s < 10 else 100, steps=30
+        tmp_path / 'second.mcap', np.eye(4), 2, lambda s: 0 if s < 10 else 100, steps=25
     )
     saved = tmp_path / 'map.yaml'
     slam_observer.succeed('replay', first, '--map', saved, *SETTINGS)

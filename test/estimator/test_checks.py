@@ -88,7 +88,7 @@ def test_a_variance_of_zero_beside_other_entries_is_named(caplog):
     assert 'a variance of zero, which says exact, has other entries in its row' in caplog.text
 
 
-@hypothesis_settings(max_examples=50)
+@hypothesis_settings(max_examples=20)
 @given(generators())
 def test_covariances_that_are_turned_there_and_back_stay_covariances(rng):
     scales = 10.0 ** rng.uniform(-6.0, 3.0, size=(20, 6)) * (rng.random((20, 6)) < 0.8)

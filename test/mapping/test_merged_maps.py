@@ -201,7 +201,7 @@ def test_far_from_the_origin_as_in_a_national_grid_nothing_is_lost_to_rounding()
     assert np.linalg.norm(world.error(estimator, 4.9)[3:]) < 0.1
 
 
-@pytest.mark.parametrize('seed', [0, 1, 11, 12, 15])
+@pytest.mark.parametrize('seed', [0, 11, 15])
 def test_a_map_can_be_saved_where_some_landmarks_are_exact_and_others_hardly_known(seed):
     """Their variances differ by more than double precision can hold in one matrix."""
     rng = np.random.default_rng(seed)

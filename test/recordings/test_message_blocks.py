@@ -51,7 +51,7 @@ def one_by_one(items):
 
 
 @given(rng=generators(), jitter_ns=st.sampled_from([0, 0, 300, 10**4]), few=st.booleans())
-@hypothesis_settings(max_examples=40)
+@hypothesis_settings(max_examples=15)
 def test_blocks_of_an_mcap_file_are_its_messages(rng, jitter_ns, few):
     """Received in any order, at equal times, of different sizes, over chunks that overlap."""
     messages = []
@@ -144,7 +144,7 @@ def read(path, fewest_in_block):
     message_type=st.sampled_from(TYPES),
     oddities=st.sampled_from([0, 1, 3]),
 )
-@hypothesis_settings(max_examples=25)
+@hypothesis_settings(max_examples=10)
 def test_velocities_in_blocks_are_those_one_by_one(rng, message_type, oddities):
     with TemporaryDirectory() as directory:
         path = Path(directory) / 'run.mcap'
@@ -202,7 +202,7 @@ def read_truth(path):
     ),
     oddities=st.sampled_from([0, 1]),
 )
-@hypothesis_settings(max_examples=20)
+@hypothesis_settings(max_examples=10)
 def test_true_poses_in_blocks_are_those_one_by_one(rng, message_type, oddities):
     with TemporaryDirectory() as directory:
         path = Path(directory) / 'run.mcap'

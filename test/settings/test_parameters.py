@@ -221,7 +221,7 @@ def test_whatever_is_given_there_are_settings_or_a_parameter_error(value):
             assert type(getattr(made, row.name)) is type(row.default)
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(st.fixed_dictionaries({}, optional={row.name: values_of(row) for row in table(Settings)}))
 def test_what_is_in_range_is_taken_and_makes_an_estimator(values):
     made = from_parameters(Settings, values)

@@ -149,7 +149,7 @@ def run(events, settings):
     return estimator
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 def test_the_smoothed_run_is_the_batch_solution(seed):
     events = small_run(seed)
     smoothed = run(events, SETTINGS).smooth()
