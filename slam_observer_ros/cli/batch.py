@@ -101,37 +101,28 @@ REPORTS, TRAJECTORIES = 'reports', 'trajectories'
 """Folders of ``--out`` for files of the runs."""
 
 
-@dataclass(frozen=True, slots=True)
-class Work:
-    """Does the jobs of a batch, and writes those files of each that are asked for."""
-
-    out: Path
-    writes_reports: bool
-    writes_trajectories: bool
-    version: str = __version__
-
-    def __call__(self, job: Job) -> Line:
-        """Do a run, write its files, and return its line of the log."""
-        if self.version != __version__:
-            raise UsageError(f'this worker has version {__version__}, the batch {self.version}')
-        report = f'{REPORTS}/{job.file_stem}.html' if self.writes_reports else None
-        tum = f'{TRAJECTORIES}/{job.file_stem}.tum' if self.writes_trajectories else None
-        request = replace(job.request, keeps_poses=tum is not None, keeps_run=report is not None)
-        with kept_warnings() as warnings:
-            result = result_of(request)
-        result = replace(result, logged=warnings)
-        if tum is not None:
-            write_tum(result.trajectory, self.out / tum)
-        if report is not None:
-            write_report(self.out / report, result, job.file_stem, summary_rows(result))
-        return {
-            'run': job.run_id,
-            'grid': job.point,
-            'report': report,
-            'trajectory': tum,
-            **identity(job.recording, job.recording_sha256, result),
-            **as_json(result),
-        }
+def do(out: Path, writes_reports: bool, writes_trajectories: bool, version: str, job: Job) -> Line:
+    """Do a run, write its files below ``out``, and return its line of the log."""
+    if version != __version__:
+        raise UsageError(f'this worker has version {__version__}, the batch {version}')
+    report = f'{REPORTS}/{job.file_stem}.html' if writes_reports else None
+    tum = f'{TRAJECTORIES}/{job.file_stem}.tum' if writes_trajectories else None
+    request = replace(job.request, keeps_poses=tum is not None, keeps_run=report is not None)
+    with kept_warnings() as warnings:
+        result = result_of(request)
+    result = replace(result, logged=warnings)
+    if tum is not None:
+        write_tum(result.trajectory, out / tum)
+    if report is not None:
+        write_report(out / report, result, job.file_stem, summary_rows(result))
+    return {
+        'run': job.run_id,
+        'grid': job.point,
+        'report': report,
+        'trajectory': tum,
+        **identity(job.recording, job.recording_sha256, result),
+        **as_json(result),
+    }
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -223,7 +214,8 @@ def run(args: argparse.Namespace) -> None:
             if first is not job:
                 logger.warning('%s is the same as %s.', job.recording, first.recording)
         try:
-            work = Work(args.out.absolute(), args.reports, args.trajectories)
+            out = args.out.absolute()
+            work = partial(do, out, args.reports, args.trajectories, __version__)
             for ended in show_progress(pool.run(work, left.values()), 'running', len(left)):
                 if ended.result is not None:
                     append(ended.result)

@@ -5,7 +5,6 @@ And what completes a word, if a shell asks for that.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 import logging
@@ -140,10 +139,3 @@ def typed_words(environment: Mapping[str, str]) -> list[str] | None:
     if '_ARGCOMPLETE' not in environment:
         return None
     return environment.get('COMP_LINE', '').split()[1:]
-
-
-def complete(parser: argparse.ArgumentParser) -> None:
-    """Write the completions and exit."""
-    import argcomplete  # which --help has no use for
-
-    argcomplete.autocomplete(parser)

@@ -18,7 +18,6 @@ with leaving_at_once():
     from typing import Any, NoReturn
 
     from slam_observer_ros.cli.console import (
-        complete,
         MessageHandler,
         PROGRAM,
         show_message,
@@ -120,7 +119,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
         words = sys.argv[1:] if arguments is None else arguments
         if (typed := typed_words(os.environ)) is not None:
-            complete(make_parser(typed))
+            import argcomplete  # which --help has no use for
+
+            argcomplete.autocomplete(make_parser(typed))  # and ends
         use_one_thread()
         with leaving_at_once():
             args = make_parser(words).parse_args(words)

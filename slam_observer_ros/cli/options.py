@@ -20,6 +20,7 @@ from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
 
 from slam_observer_ros.common.errors import ParameterError, UsageError
+from slam_observer_ros.common.findings import in_brief
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import (
     InputSettings,
@@ -193,17 +194,12 @@ def _for_estimator(values: Mapping[str, object]) -> dict[str, object]:
         logger.warning(
             "The node can't read %s of --config: in ROS all numbers of a list are written alike, "
             '0.0 for 0.',
-            _listed(mixed),
+            in_brief(mixed, MAX_LISTED, ', '),
         )
     if unknown:
-        logger.warning('Unknown parameters of --config are ignored: %s.', _listed(unknown))
+        listed = in_brief(unknown, MAX_LISTED, ', ')
+        logger.warning('Unknown parameters of --config are ignored: %s.', listed)
     return {name: value for name, value in values.items() if name in _ESTIMATOR_NAMES}
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Return names as text; of a great many, the first."""
-    more = len(names) - MAX_LISTED
-    return ', '.join([*names[:MAX_LISTED], *([f'and {more} more'] if more > 0 else [])])
 
 
 def find_config(name: str) -> Path:

@@ -570,10 +570,6 @@ def muted_warnings() -> Iterator[None]:
         _LOGGER.setLevel(level)
 
 
-NAMED = 3
-"""Problems that a line for people names: the others have to be looked up."""
-
-
 def worst_first(findings: Sequence[Finding], faults: Sequence[str]) -> list[str]:
     """Return what is wrong in words: errors, then faults of the inputs, then the rest.
 
@@ -584,7 +580,7 @@ def worst_first(findings: Sequence[Finding], faults: Sequence[str]) -> list[str]
     return [*errors, *faults, *(each.what for each in by_level[len(errors) :])]
 
 
-def in_brief(problems: Sequence[str]) -> str:
-    """Return the first problems on one line, and how many more there are."""
-    more = len(problems) - NAMED
-    return '; '.join([*problems[:NAMED], *([f'and {more} more'] if more > 0 else [])])
+def in_brief(texts: Sequence[str], most: int = 3, joint: str = '; ') -> str:
+    """Return the first texts on one line, and how many more there are, to be looked up."""
+    more = len(texts) - most
+    return joint.join([*texts[:most], *([f'and {more} more'] if more > 0 else [])])

@@ -95,14 +95,10 @@ _NOT_FINITE = re.compile(r'[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
 def write_map(
     path: Path, landmark_map: LandmarkMap, settings: Settings | None, backup: Path | None = None
 ) -> None:
-    """Write a map, and with which settings it was made, if with any.
+    """Write a map, and the settings it was made with, if any; whole, or a MapError is raised.
 
-    The file appears whole or not at all. Correlations between too many landmarks are left out,
-    with a warning.
-
-    ``backup`` is a file to be a copy of the one that is replaced, once the new one is written.
-
-    Raise :exc:`MapError` if the map is empty, or the file can't be written.
+    Correlations between too many landmarks are left out, with a warning. ``backup`` becomes a copy
+    of the file that is replaced, once the new one is written.
     """
     if not len(landmark_map.ids):
         raise MapError(f'the map is empty: nothing is written to {path}')
@@ -131,10 +127,7 @@ def write_map(
 
 
 def check_writable(path: Path) -> None:
-    """Check that a map could be written, before there is one.
-
-    Raise :exc:`MapError` if its directory takes no file, or the path is a directory.
-    """
+    """Raise a MapError if no map could be written there, before there is one."""
     with failing(MapError, f"can't write map {path}"):
         if path.is_dir():
             raise MapError(f"can't write map {path}: it is a directory")
@@ -172,12 +165,9 @@ def read_map(path: Path) -> LandmarkMap:
 
 
 def read_maps(path: Path) -> list[LandmarkMap]:
-    """Read a map, or all maps of a folder: the robot is in one of them.
+    """Read a map, or all maps of a folder, where there is one: the robot is in one of them.
 
-    In a folder files that are no maps are skipped, and of maps that say the same one is taken,
-    with a warning.
-
-    Raise :exc:`MapError` as :func:`read_map` does, or if there is none in the folder.
+    With a warning, files that are no maps are skipped, and of maps that say the same one is taken.
     """
     files, maps = map_files(path), list[LandmarkMap]()
     if files == [path]:
@@ -382,10 +372,7 @@ def _expect(holds: bool, message: str) -> None:
 def _correlation_lines(
     joint: FloatArray | None, landmarks: Sequence[Mapping[str, Any]]
 ) -> list[str]:
-    """Return the line for a joint covariance of ``landmarks`` as they are written.
-
-    And no line where there is none, or with a warning where it is too large.
-    """
+    """Return the line for a joint covariance of ``landmarks``, if there is one, not too large."""
     if joint is None:
         return []
     if len(landmarks) > MAX_CORRELATED:

@@ -29,6 +29,7 @@ from slam_observer_ros.runs.metrics import (
     average_nees_band,
     CHI_SQUARE_95,
     normalised_squared_errors,
+    root_mean_square,
 )
 from slam_observer_ros.runs.result import Result
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -229,7 +230,8 @@ def _landmarks(result: Result) -> list[Json]:
             used & (innovations.weights < 1.0),
             of_it & innovations.moved,
         ]
-        fit = [_rms(innovations.residuals_m[used]), _rms(innovations.distances[used])]
+        fits = innovations.residuals_m[used], innovations.distances[used]
+        fit = [root_mean_square(each) if used.any() else math.nan for each in fits]
         rows.append(
             [
                 landmark_id,
@@ -238,10 +240,6 @@ def _landmarks(result: Result) -> list[Json]:
             ]
         )
     return rows
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
 
 
 def _errors(result: Result) -> dict[str, Json]:

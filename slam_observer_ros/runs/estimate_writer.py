@@ -67,7 +67,7 @@ class EstimateWriter:
         rate_hz: float,
         publishes_tf: bool,
     ) -> None:
-        self._writer = writer
+        self._writer, self._write = writer, writer.write_message
         self._messages = EstimateMessages(writer.messages, map_frame)
         self._state = StateMessages(map_frame, base_frame)
         self._map_frame, self._base_frame = map_frame, base_frame
@@ -111,10 +111,7 @@ class EstimateWriter:
             self._write('/nis', self._messages.value(per_degree), update.stamp_ns)
 
     def finish(
-        self,
-        estimator: Estimate,
-        errors: TrajectoryErrors | None,
-        landmarks: LandmarkTruth | None,
+        self, estimator: Estimate, errors: TrajectoryErrors | None, landmarks: LandmarkTruth | None
     ) -> None:
         """Write the path, the map at the end, and the truth moved to where the estimate has it."""
         stamp_ns = estimator.stamp_ns
@@ -150,28 +147,18 @@ class EstimateWriter:
             self._path.append(self._messages.path_pose(stamp_ns, pose))
 
     def _write_landmarks(self, estimator: Estimate, stamp_ns: int) -> None:
-        landmarks = (
-            estimator.landmark_ids,
-            estimator.world_points,
-            estimator.landmark_covariances,
-        )
-        velocities = estimator.landmark_velocities
+        points, velocities = estimator.world_points, estimator.landmark_velocities
+        landmarks = estimator.landmark_ids, points, estimator.landmark_covariances
         cloud = self._messages.landmarks(stamp_ns, *landmarks, velocities)
         self._write(MAP_TOPIC, cloud, stamp_ns, latched=True)
         markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
         self._write('/markers', markers, stamp_ns)
-        self._write(
-            DIAGNOSTICS_TOPIC,
-            diagnostics(self._writer.messages, stamp_ns, estimator, self._base_frame),
-            stamp_ns,
-        )
+        status = diagnostics(self._writer.messages, stamp_ns, estimator, self._base_frame)
+        self._write(DIAGNOSTICS_TOPIC, status, stamp_ns)
         for part in estimator.calibration:
             topic = f'/calibration/{part.name}'
             self._write(topic, self._messages.value(part.value), stamp_ns)
             self._write(f'{topic}_stddev', self._messages.value(part.deviation), stamp_ns)
-
-    def _write(self, topic: str, message: Any, stamp_ns: int, latched: bool = False) -> None:
-        self._writer.write_message(topic, message, stamp_ns, latched=latched)
 
 
 @contextmanager
