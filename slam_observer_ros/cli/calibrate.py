@@ -10,7 +10,6 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,6 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.lie import so3
-from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_file import read_map
 from slam_observer_ros.models.calibration import Entry, OF_SENSOR, OF_VELOCITY
 from slam_observer_ros.recordings.opening import files_of
@@ -129,9 +127,9 @@ def run(args: argparse.Namespace) -> None:
     check_outputs([args.out], args.force)
     # What is held out is only looked at, before the long search.
     with muted_warnings():  # they are shown when it is judged
-        hashes = [_read(request, path, 1.0, survey).sha256 for path in args.hold_out]
+        hashes = [read_material(request, path, 1.0, survey).sha256 for path in args.hold_out]
     share = 0.0 if args.hold_out else HELD_OUT_SHARE
-    materials = [_read(request, path, share, survey) for path in args.recordings]
+    materials = [read_material(request, path, share, survey) for path in args.recordings]
     hashes += [material.sha256 for material in materials]
     if len(set(hashes)) < len(hashes):
         raise UsageError('a recording is given twice; what is trained on can not be held out, too')
@@ -148,12 +146,12 @@ def run(args: argparse.Namespace) -> None:
         corrected = replace(request, inputs=stated.inputs)
         trained_on = materials
         if corrected != request:
-            trained_on = [_read(corrected, path, share, survey) for path in args.recordings]
+            trained_on = [read_material(corrected, p, share, survey) for p in args.recordings]
         held_out: Iterable[tuple[Material, ...]] = zip(materials, trained_on, strict=True)
         if args.hold_out:
             requests = (request, corrected)
             held_out = (
-                tuple(_read(each, path, 1.0, survey) for each in requests)
+                tuple(read_material(each, path, 1.0, survey) for each in requests)
                 for path in args.hold_out
             )
         rows = [
@@ -201,11 +199,6 @@ class _Calibration:
         """Pairs of values that can't be distinguished."""
         of_size = [COMMON_SCALE] if self.found.has_no_size else []
         return of_size + trades(self.found.parts, self.found.correlations)
-
-
-def _read(request: Request, path: Path, share: float, survey: LandmarkMap | None) -> Material:
-    """Read a recording, of which a share, at its end, is held out."""
-    return read_material(replace(request, recording=path), share, survey)
 
 
 def _found(

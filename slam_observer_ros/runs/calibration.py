@@ -190,12 +190,11 @@ class Material:
 
 
 def read_material(
-    request: Request, held_out_share: float, landmark_map: LandmarkMap | None = None
+    request: Request, path: Path, held_out_share: float, landmark_map: LandmarkMap | None
 ) -> Material:
-    """Read a recording; its last part is to be held out."""
-    path = request.recording
+    """Read a recording as is asked for; its last part is to be held out."""
     with Recording(path) as recording:
-        selected, inputs, truth = request.select_inputs(recording)
+        selected, inputs, truth = replace(request, recording=path).select_inputs(recording)
         events = list(recording.events(selected, inputs, request.settings.velocity_timeout))
     seen = [event for event in events if isinstance(event, ObservationEvent) and len(event.ids)]
     if not seen:

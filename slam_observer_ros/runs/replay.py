@@ -247,7 +247,8 @@ class _RunningReplay:
         self._in_known_map = landmark_map is not None
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
-        self._truth = truth
+        self._pose_truth = truth.trajectory if truth else None
+        self._landmark_tracks = truth.tracks if truth else None
         self._events = self._observations = self._used_points = self._angular_velocities = 0
         self._seconds = 0.0
         self._clear_figures()
@@ -321,7 +322,7 @@ class _RunningReplay:
             return
         self._localised_ns = (self._localised_ns or (first_ns,))[0], last_ns
         if self._keep_all and len(due_ns := stamps_ns[self._samples.due(stamps_ns)]):
-            has_truth = self._truth is not None and len(self._truth.stamps_ns) > 0
+            has_truth = self._pose_truth is not None and len(self._pose_truth) > 0
             self._samples.add(due_ns, *self._estimator.poses_at(due_ns, has_truth))
 
     def _on_update(self, update: Update) -> None:
@@ -332,7 +333,7 @@ class _RunningReplay:
         used = used_points(self._estimator.counts)
         self._observations += used > self._used_points
         self._used_points = used
-        if self._truth is None or self._truth.tracks is None:
+        if self._landmark_tracks is None:
             return
         # What is compared with the truth is kept; it is compared now if a covariance may be due.
         self._uncompared.append((update, known, world_points))
@@ -351,11 +352,11 @@ class _RunningReplay:
 
     def _compare(self, is_nees_due: bool) -> None:
         """Compare what is kept with the truth; a covariance is known of the last of it."""
-        if self._truth is None or (tracks := self._truth.tracks) is None:
+        if self._pose_truth is None or self._landmark_tracks is None:
             return
         kept, self._uncompared = self._uncompared, []
         stamps_ns = np.array([update.stamp_ns for update, *_ in kept], dtype=np.int64)
-        true_poses, covered = interpolate(self._truth.trajectory, stamps_ns)
+        true_poses, covered = interpolate(self._pose_truth, stamps_ns)
         for row in np.flatnonzero(covered).tolist():
             update, ids, points = kept[row]
             covariance_of = None
@@ -368,7 +369,7 @@ class _RunningReplay:
                 ids,
                 points,
                 true_poses[row],
-                tracks.at(update.stamp_ns),
+                self._landmark_tracks.at(update.stamp_ns),
                 covariance_of,
                 update.ids[~update.rejected],
             )
