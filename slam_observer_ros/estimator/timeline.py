@@ -57,7 +57,8 @@ class Timeline:
     ) -> None:
         self._hypotheses, self._settings = hypotheses, settings
         timeout_ns = to_ns(settings.velocity_timeout)
-        self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
+        bias = np.array(settings.angular_bias)
+        self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode, bias)
         self.stamp_ns: int | None = None  # of the last event used; None before the first
         self.state_ns: int | None = None  # of the hypotheses: velocities since are pending
         # A delay, and half of the time over which velocities are averaged to estimate it.

@@ -262,6 +262,11 @@ class Gains(ABC):
         changed, where most are rejected and that may be refused.
         """
 
+    def know_calibration(  # noqa: B027 (constant gains estimate none)
+        self, r: FloatArray, H: FloatArray, R: FloatArray
+    ) -> None:
+        """Move the state by how far a calibration is off: r = H c̃ + noise, R (q, q)."""
+
     def activate(self, rows: IntArray) -> None:  # noqa: B027 (most gains treat all alike)
         """See to it that landmarks (m,) are at hand that are going to be observed."""
 
@@ -284,13 +289,6 @@ class Gains(ABC):
         e, r = observer.errors(rows, points)
         turned = observer.turned(covariances)
         return Residuals(rows, e, r, observer.a[rows], turned, dt_s, repeated, D)
-
-    def learn_bias(self, angular_velocity: FloatArray, variances: FloatArray) -> bool:
-        """Take an angular velocity (3,), rad/s, measured at rest for the bias of turning.
-
-        Return whether that was used.
-        """
-        return False
 
     # Landmarks and sensors
 

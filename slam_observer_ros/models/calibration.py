@@ -246,11 +246,19 @@ class Calibration:
         rates: FloatArray = with_moves(measured_velocities).take(self._columns, axis=1)
         return rates
 
-    def turning_biases(self) -> tuple[IntArray, IntArray]:
-        """Return which of the c entries are biases of turning, and about which axes."""
-        places = self._places[: self.of_velocity]
-        entries = np.flatnonzero((places < DELAY // 2) & (places % 7 == MOVES))
-        return entries, places[entries] // 7
+    def at_rest(self, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how fast the robot turns by a gyroscope's ``rate`` (3,): (q,), and H (q, c).
+
+        About the q axes of turns; H is how fast it turns per unit of an error. Where it stands,
+        that is how far the estimates are off.
+        """
+        velocity, H = np.append(rate, np.zeros(3)), np.zeros((6, self.count))
+        H[self._rows, np.arange(len(self._rows))] = self._rates(velocity[None])[0]
+        # Nothing else than a bias turns a robot that stands.
+        is_bias = self._columns == MOVES
+        H[~np.isin(np.arange(6), self._rows[is_bias])] = 0.0
+        turned = np.arange(3)[self.axes.pose]
+        return self.apply(velocity)[turned], H[turned]
 
     def initial_covariance(self) -> FloatArray:
         """Return the covariance (p + c, p + c) of (ε, c̃) at the start, without error of Â."""

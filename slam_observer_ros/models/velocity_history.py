@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, fields, replace
 import math
 from statistics import median_low
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -39,8 +39,17 @@ STANDS_NS = NANOSECONDS_PER_SECOND
 Commands are ahead of the robot by their delay, and it coasts; both take less than that.
 """
 
-TURNS = 0.02
-"""Angular velocity beyond which it is not the bias of a gyroscope, rad/s: the robot turns."""
+TURNS = 0.03
+"""Angular velocity, less the bias at rest, beyond which the robot turns, rad/s.
+
+No bias is larger; the noise of a MEMS gyroscope's reading is a third as large.
+"""
+
+INSTABILITY = 1e-4
+"""Standard deviation of a gyroscope's bias that no average makes less, rad/s: 20° an hour.
+
+The instability of a MEMS gyroscope, by data sheets; a robot that stands turns by less, too.
+"""
 
 STANDING = 1e-4**2 * np.eye(6)
 """(6, 6) covariance of the velocity of a robot that stands, rad²/s² and m²/s²: next to none.
@@ -53,28 +62,6 @@ FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
 
 
-class Rest(NamedTuple):
-    """The mean of n angular velocities of a gyroscope while the robot stands."""
-
-    angular_velocity: FloatArray  # (3,) rad/s
-    variances: FloatArray  # (3,) of a single one, as stated; zero if unknown
-    taken: int  # n
-    begin_ns: int
-    end_ns: int
-
-    def joined(self, other: Rest) -> Rest:
-        """Return the mean of both."""
-        n = self.taken + other.taken
-        share = other.taken / n
-        return Rest(
-            (1.0 - share) * self.angular_velocity + share * other.angular_velocity,
-            (1.0 - share) * self.variances + share * other.variances,
-            n,
-            self.begin_ns,
-            other.end_ns,
-        )
-
-
 class VelocityHistory:
     """Velocities in stamp order, joined with the angular velocities of another sensor.
 
@@ -83,7 +70,9 @@ class VelocityHistory:
     plane z = 0 count.
     """
 
-    def __init__(self, timeout_ns: int, is_planar: bool = False) -> None:
+    def __init__(
+        self, timeout_ns: int, is_planar: bool = False, bias: FloatArray | None = None
+    ) -> None:
         self._timeout_ns = timeout_ns
         self._is_planar = is_planar
         # In force from each stamp to the next; the first one is in force before any event.
@@ -95,7 +84,9 @@ class VelocityHistory:
         # Who has no odometry may publish zeros, and state how the robot may move as their noise.
         self._has_moved = False
         self._stands = False
-        self._rest: Rest | None = None
+        # About which axes turns count.
+        self._counts = np.array([0.0, 0.0, 1.0]) if is_planar else np.ones(3)
+        self._at_rest = _AtRest(self._counts * (np.zeros(3) if bias is None else -bias))
 
     def append(self, measured: MeasuredVelocity) -> bool:
         """Add velocities that are not earlier than any other; return whether they are in force.
@@ -106,14 +97,15 @@ class VelocityHistory:
         if isinstance(measured, AngularVelocityEvent):
             self._angular_periods.add(measured.stamp_ns)
             self._angular = measured
+            if self._zero_since_ns is not None:
+                stood_ns = measured.stamp_ns - self._zero_since_ns
+                self._at_rest.add(stood_ns, self._counts * measured.angular_velocity)
             if self._count == 1:
                 return False
             first = self._new_row(1)
             self._joined.repeat_last(first, measured.stamp_ns)
             self._joined.usual_s[first, 1] = self._periods.usual_s
             stand = [first] * self._stands
-            if self._stands:
-                self._note_rest(measured)
         elif isinstance(measured, VelocityEvent):
             first, one, usual_s = self._new_row(1), measured, self._took(measured)
             self._joined.write(first, one.stamp_ns, one.body_velocity, one.covariance, usual_s)
@@ -163,7 +155,8 @@ class VelocityHistory:
     def _let_stand(self, rows: IntArray) -> None:
         """Let velocities (k,) be zero, and be known to be, unless a gyroscope says otherwise."""
         joined = self._joined
-        turn = np.linalg.norm(joined.body_velocities[rows, :3], axis=1) > TURNS
+        rates = self._counts * joined.body_velocities[rows, :3]
+        turn = self._at_rest.turns(rates) & rates.any(axis=1)
         if np.count_nonzero(turn):
             self.doubt_standing()
             rows = rows[~turn]
@@ -173,23 +166,11 @@ class VelocityHistory:
     def doubt_standing(self) -> None:
         """Begin again to judge whether the robot stands: something else contradicts it."""
         self._zero_since_ns, self._stands = None, False
-        self.forget_rest()
 
-    def _note_rest(self, measured: AngularVelocityEvent) -> None:
-        covariance = measured.covariance
-        variances = np.zeros(3) if covariance is None else np.diagonal(covariance)
-        now = Rest(measured.angular_velocity, variances, 1, measured.stamp_ns, measured.stamp_ns)
-        self._rest = now if self._rest is None else self._rest.joined(now)
-
-    def rest(self, stamp_ns: int) -> Rest | None:
-        """Return what a gyroscope says while the robot stands, at a stamp; None for nothing."""
-        if self._rest is not None and not self.stood_s(stamp_ns):
-            self.forget_rest()
-        return self._rest
-
-    def forget_rest(self) -> None:
-        """Begin again to take the mean of what a gyroscope says at rest."""
-        self._rest = None
+    def taken_at_rest(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Return and forget means of a gyroscope at rest (3,), rad/s, with variances (3,)."""
+        taken, self._at_rest.means = self._at_rest.means, []
+        return taken
 
     def stood_s(self, stamp_ns: int) -> float:
         """Return for how long the robot has stood at a stamp, seconds; 0 while it moves."""
@@ -307,6 +288,49 @@ class VelocityHistory:
         if self._is_planar:
             return flatten_velocities(body_velocities)
         return np.array(body_velocities)
+
+
+class _AtRest:
+    """What a gyroscope shows while wheels stand, in pieces that last twice as long each time.
+
+    So bias is known the better the longer the robot stands, but with the logarithm of time alone,
+    as its instability allows. The first piece is of a robot that may coast, and the second one
+    begins in it: they say no more than which rate is to be taken for rest.
+    """
+
+    def __init__(self, rate: FloatArray) -> None:
+        self._usual, self._rate = rate, rate  # (3,) as stated, and as found last
+        self.means: list[tuple[FloatArray, FloatArray]] = []
+        self._pieces, self._due_ns, self._before_ns = 0, 0, 0
+        self._count, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
+
+    def add(self, stood_ns: int, rate: FloatArray) -> None:
+        """Take in a reading (3,), rad/s, ``stood_ns`` after wheels stopped."""
+        if self._due_ns == 0 or stood_ns < self._before_ns:
+            self._pieces, self._due_ns = 0, 3 * STANDS_NS // 4
+            self._begin()
+        self._before_ns = stood_ns
+        off = rate - self._usual
+        self._count, self._sum = self._count + 1, self._sum + off
+        self._squares += off**2
+        if stood_ns < self._due_ns or self._count < FEWEST_PERIODS:
+            return
+        mean = self._sum / self._count
+        variances = np.maximum(self._squares / self._count - mean**2, 0.0) / (self._count - 1)
+        self._pieces, self._due_ns = self._pieces + 1, 2 * stood_ns
+        self._begin()
+        if np.linalg.norm(mean) > TURNS:
+            return
+        self._rate = self._usual + mean
+        if self._pieces > 2:
+            self.means.append((self._rate, variances + INSTABILITY**2))
+
+    def _begin(self) -> None:
+        self._count, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
+
+    def turns(self, rates: FloatArray) -> BoolArray:
+        """Return which rates (k, 3), rad/s, are of a robot that turns."""
+        return np.asarray(np.linalg.norm(rates - self._rate, axis=1) > TURNS)
 
 
 class _Periods:

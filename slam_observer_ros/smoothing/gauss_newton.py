@@ -100,7 +100,7 @@ class Smoother:
         for _ in range(iterations):
             if len(self._are_half):
                 self._complete(start)
-            factors = ChainFactors(self._linearise(start, gated))
+            factors = self._factors(start, gated)
             change, border_change = factors.solve()
             step = Step(start, self._moved(start, change, border_change), factors)
             if max(np.abs(change[-1]).max(), np.abs(border_change).max(initial=0.0)) < tolerance:
@@ -122,7 +122,21 @@ class Smoother:
         """Return ``start``, if something is gated there after an iteration without the gate."""
         if not self._observations.some_are_gated(start):
             return start
-        return self._moved(start, *ChainFactors(self._linearise(start, gated=False)).solve())
+        return self._moved(start, *self._factors(start, gated=False).solve())
+
+    def _factors(self, solution: Solution, gated: bool) -> ChainFactors:
+        equations = self._linearise(solution, gated)
+        if (besides := self._prior.besides) is not None:
+            information, vector = besides
+            c, d = len(vector), self._axes.p
+            gradient = information @ solution.calibrations[0] - vector
+            if self._shared:
+                equations.corner[:c, :c] += information
+                equations.border_gradient[:c] += gradient
+            else:
+                equations.diagonal[0, d:, d:] += information
+                equations.gradient[0, d:] += gradient
+        return ChainFactors(equations)
 
     def _moved(
         self, solution: Solution, change: FloatArray, border_change: FloatArray

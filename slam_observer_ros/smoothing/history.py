@@ -220,6 +220,18 @@ class History:
             first = end
         *self._summarised, self._latest = pieces
 
+    @property
+    def drift(self) -> FloatArray:
+        """By how much the covariance (c, c) of the calibration has grown since the prior."""
+        parts = [part.drift_covariances for part in [*self._summarised, self._gathered()]]
+        grown: FloatArray = np.sum(np.concatenate(parts), axis=0)
+        return grown + (self._motion or self._at_rest())[2]
+
+    def know_calibration(self, information: FloatArray, vector: FloatArray) -> None:
+        """Note what is known of the calibration besides: :attr:`.Prior.besides`."""
+        self.prior = self.prior.knowing(information, vector)
+        self.summary = self.summary.knowing(information, vector)
+
     def add_calibration(self, values: FloatArray, variances: FloatArray) -> None:
         """Append entries (c,) of a calibration that are estimated from now on."""
         self._summarised = [part.with_calibration(values) for part in self._summarised]

@@ -35,6 +35,8 @@ class Prior:
     # Whether the covariance is of (η, dc, dy) instead, with y_i = P⁻¹ p_i as seen from the pose;
     # then orientations are as seen from there, too.
     is_relative: bool = False
+    # Λ (c, c) and λ (c,) of the calibration that has been measured besides: −ln p = ½ cᵀΛc − λᵀc
+    besides: tuple[FloatArray, FloatArray] | None = None
 
     def relative(self, axes: EstimatedAxes) -> Prior:
         """Return the same knowledge, but of where the landmarks lie as seen from the pose.
@@ -94,8 +96,17 @@ class Prior:
         covariance[np.ix_(at, at)] = self.covariance
         new = np.arange(first, first + more)
         covariance[new, new] = variances
-        calibration = np.append(self.calibration, values)
-        return replace(self, calibration=calibration, covariance=covariance)
+        calibration, besides = np.append(self.calibration, values), self.besides
+        if besides is not None:
+            information, vector = besides
+            besides = np.pad(information, (0, more)), np.pad(vector, (0, more))
+        return replace(self, calibration=calibration, covariance=covariance, besides=besides)
+
+    def knowing(self, information: FloatArray, vector: FloatArray) -> Prior:
+        """Return the prior with more that is known of the calibration ``besides``."""
+        if self.besides is not None:
+            information, vector = information + self.besides[0], vector + self.besides[1]
+        return replace(self, besides=(information, vector))
 
     def with_unknown(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior with landmarks at ``rows`` that may be anywhere."""

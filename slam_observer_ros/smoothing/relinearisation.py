@@ -130,6 +130,9 @@ class Past:
     def slip(self, start: FloatArray, motion: Advanced) -> None:
         """Note a slip from a pose (4, 4), which may not have happened."""
 
+    def know_calibration(self, r: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        """Note how far the calibration is off: r = H c̃ + noise, R (q, q)."""
+
     def note_correction(self, before: FloatArray, after: FloatArray) -> None:
         """Note a correction that turned the robot from Â to another (4, 4)."""
 
@@ -167,9 +170,6 @@ class Past:
 
     def merge(self, rows: IntArray, copies: IntArray) -> None:
         """Take landmarks ``copies`` (m,) for ``rows`` (m,), as the filter has done."""
-
-    def sum_up(self) -> None:
-        """Let the present estimate stand for all that was seen until now."""
 
     def smooth(self) -> tuple[Step, int, History]:
         """Return the last step of smoothing, how many slips it confirms, and what it is of.
@@ -238,6 +238,17 @@ class Relinearisation(Past):
         turn_rad = 2.0 * math.asin(min(half_sine, 1.0))
         self._turn_squared += turn_rad**2
         self._largest_turn = max(self._largest_turn, turn_rad)
+
+    def know_calibration(self, r: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        """Note how far the calibration is off: r = H c̃ + noise, R (q, q)."""
+        if not self.is_active:
+            return
+        # All is linear in it. Where it drifts, so much less is known of it as it was at first.
+        history, values = self.history, self._calibration.values
+        if self._calibration.drifts:
+            R = R + H @ history.drift @ H.T
+        weighted = np.linalg.solve(R, H).T
+        history.know_calibration(weighted @ H, weighted @ (H @ values - r))
 
     def add(self, keyframe: Keyframe, in_doubt: bool) -> None:
         """Add a keyframe; relinearise the latest ones if it is time.
@@ -325,7 +336,8 @@ class Relinearisation(Past):
             return
         are_latest = numbers.min() >= self.history.summarised
         if not (are_latest and self._relinearise(ENTRY_ITERATIONS)):
-            self.sum_up()
+            self.history.summarise(self._known().least_nonlinear(self._axes)[0])
+            self._clear_counts()
 
     def add_calibration(self) -> None:
         """Note entries of the calibration that are estimated from now on."""
@@ -353,12 +365,7 @@ class Relinearisation(Past):
         """
         were_summed_up = np.min(copies) < len(self.history.summary.points)
         self.history.merge(rows, copies)
-        if were_summed_up:
-            self.sum_up()
-
-    def sum_up(self) -> None:
-        """Let the present estimate stand for all that was seen until now."""
-        if self.is_active and self._is_dense:
+        if were_summed_up and self.is_active:
             self.history.summarise(self._known().least_nonlinear(self._axes)[0])
             self._clear_counts()
 

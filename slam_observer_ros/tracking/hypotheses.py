@@ -248,12 +248,12 @@ class Hypotheses:
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
         stood_s, flat = velocities.stood_s(end_ns), velocities.flat()
-        rest = velocities.rest(end_ns)
-        if rest is not None and sum([state.learn_bias(rest) for state in self.states]):
-            velocities.forget_rest()
+        at_rest = velocities.taken_at_rest()
         for hypothesis in self._all:
             state = hypothesis.state
             state.observation_noise.stood_s = stood_s
+            for rate, rate_variances in at_rest:
+                state.learn_at_rest(rate, rate_variances)
             before = state.observer.A.copy()
             variances = state.advance(flat, start_ns, end_ns)
             if state is not self.best:

@@ -19,7 +19,6 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.matrices import correlations_of
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
-from slam_observer_ros.models.velocity_history import Rest
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
@@ -133,21 +132,15 @@ class State:
             self.end_velocity = motion.at_end
         return motion.variances
 
-    def learn_bias(self, rest: Rest) -> bool:
-        """Take what a gyroscope says at rest for its bias; return whether that was used.
-
-        It is once it halves a variance: then what was seen before is not linearised again.
-        """
-        duration_s = to_s(rest.end_ns - rest.begin_ns)
-        if duration_s <= 0.0:
-            return False
-        densities = self.motion_noise.figures.densities[:3]
-        stated, is_stated = rest.variances / rest.taken, rest.variances > 0.0
-        variances = np.where(is_stated, stated, densities / duration_s)
-        is_used = self.gains.learn_bias(rest.angular_velocity, variances)
-        if is_used:
-            self.relinearisation.sum_up()
-        return is_used
+    def learn_at_rest(self, rate: FloatArray, variances: FloatArray) -> None:
+        """Learn the bias of a gyroscope of which a mean ``rate`` (3,) is of rest, rad/s."""
+        r, H = self.calibration.at_rest(rate)
+        if not H.any():
+            return
+        R, before = np.diag(variances[-len(r) :]), self.observer.A.copy()
+        self.relinearisation.know_calibration(r, H, R)
+        self.gains.know_calibration(r, H, R)
+        self.relinearisation.note_correction(before, self.observer.A)
 
     def slip(self, after: FloatArray, covariance: FloatArray) -> None:
         """Let the robot be at Â = ``after`` (4, 4), by a motion that odometry has not seen.

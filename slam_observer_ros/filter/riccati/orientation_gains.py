@@ -63,24 +63,6 @@ class OrientationGains(Errors, Gains):
         C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
         self.motion_noise.factors.learn(r, S, C)
 
-    def learn_bias(self, angular_velocity: FloatArray, variances: FloatArray) -> bool:
-        """Take an angular velocity (3,), rad/s, measured at rest for the bias of turning.
-
-        With 0 = M V + b it is off by r = M V + b̂ = b̃ + noise of ``variances`` (3,). Nothing
-        changes, and False is returned, if it would not halve any variance, or is beyond the gate.
-        """
-        entries, axes = self.calibration.turning_biases()
-        columns, P = self.axes.p + entries, self.joint.P
-        rates = self.calibration.rates
-        r = (rates[:3, :3].dot(angular_velocity) + rates[:3, 6])[axes]
-        known, R = P[columns, columns], variances[axes]
-        gate = self._settings.rejection_threshold
-        if not (known > R).any() or (r**2 > gate**2 * (known + R)).any():
-            return False
-        HP = P[columns].copy()
-        self._move(-self.joint.update(HP, HP[:, columns] + np.diag(R), r))
-        return True
-
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Correct the state by known orientations that were seen.
 

@@ -110,6 +110,12 @@ class RiccatiGains(OrientationGains):
         self._move_others(out.moved, before)
         return out
 
+    def know_calibration(self, r: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        """Move the state by how far a calibration is off: r = H c̃ + noise, R (q, q)."""
+        joint, of_c = self.joint, slice(self.axes.p, self.joint.chart.robot)
+        HP = H @ joint.P[of_c]
+        self._move(-joint.update(HP, HP[:, of_c] @ H.T + R, r))
+
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks (m,) are in P."""
         self.joint.activate(rows)
