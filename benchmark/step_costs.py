@@ -7,6 +7,7 @@ estimator does only now and then is in it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 import time
 
@@ -27,6 +28,7 @@ SEEN = (1, 3, 10, 30, 100)
 MANY_KNOWN, FEW_SEEN = 300, 3  # of the table that does not vary them
 CROWD = 200
 LARGE_MAP, LARGE_SEEN = 5000, 20
+MOST_POINTS = Settings().max_points
 
 RATE_HZ = 20
 SPEED_M_S = 1.0
@@ -68,7 +70,8 @@ def measure_large() -> Tables:
 
 def step_s(name: str, known: int, seen: int) -> float:
     """Return the mean CPU time of a step, seconds."""
-    estimator = make(name, settings_for(known))
+    settings = replace(settings_for(known), max_points=max(seen, MOST_POINTS))
+    estimator = make(name, settings)
     start, steps = drive(known, seen)
     for event in start:
         estimator.add(event)
@@ -107,13 +110,16 @@ def drive(known: int, seen: int) -> tuple[list[Event], list[list[Event]]]:
     grid = SPACING_M * (np.stack(np.divmod(np.arange(known), side), axis=-1) - 0.5 * side)
     points = np.column_stack([grid + 0.3, rng.uniform(-1.0, 1.0, known)])
     velocity = np.array([0.0, 0.0, 0.0, SPEED_M_S, 0.0, 0.0])
-    start: list[Event] = [
-        VelocityEvent(0, velocity),
-        ObservationEvent(0, np.arange(known), _noisy(points, rng)),
-    ]
+    # The robot stands until it has seen all: of a message no more than ``max_points`` are used.
+    start: list[Event] = []
+    period_ns = 1_000_000_000 // RATE_HZ
+    for ids in np.split(np.arange(known), range(MOST_POINTS, known, MOST_POINTS)):
+        now_ns = len(start) // 2 * period_ns
+        start.append(VelocityEvent(now_ns, velocity * (ids[-1] == known - 1)))
+        start.append(ObservationEvent(now_ns, ids, _noisy(points[ids], rng)))
     steps: list[list[Event]] = []
     for step in range(1, STEPS + 1):
-        stamp_ns = step * 1_000_000_000 // RATE_HZ
+        stamp_ns = now_ns + step * period_ns
         pose = np.eye(4)
         pose[0, 3] = SPEED_M_S * step / RATE_HZ
         local = se3.transform(se3.inverse(pose), points)
