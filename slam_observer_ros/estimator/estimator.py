@@ -377,11 +377,13 @@ class Estimator(Estimate):
                 self._half_points.clear()
                 # It is in the same map again later, unless there are several.
                 self._warnings.two_places.doubt(is_all=len(self._localiser.maps) > 1)
-            elif was_localised and (loaded := self._localiser.loaded) is not None:
-                known = loaded.ids, loaded.covariances
-                if self._hypotheses.follow_drift(event, update, *known):
-                    self._timeline.velocities.doubt_standing()
-                    self._localiser.doubt_strayed(self._state, update)
+            elif (
+                was_localised
+                and (loaded := self._localiser.loaded) is not None
+                and self._hypotheses.judge_views(loaded.ids, loaded.covariances)
+            ):
+                self._timeline.velocities.doubt_standing()
+                self._localiser.doubt_strayed(self._state, update)
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
             self._find_doubled(event.stamp_ns)

@@ -13,7 +13,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor
 from slam_observer_ros.models.motion_noise import MEMORY, PRIOR_DEVIATION, proposed
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking.standing import LAST_TEST_NS, UNSEEN_NS
+from slam_observer_ros.tracking.slip import LAST_TEST_NS, UNSEEN_NS
 
 SAMPLE_NS = LAST_TEST_NS // 10
 """How often it is looked at what was learnt: slips show within ten looks."""

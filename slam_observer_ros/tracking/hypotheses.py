@@ -46,7 +46,7 @@ from slam_observer_ros.tracking.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.tracking.standing import Drift, MAX_MOTIONS, Standing, take_back
+from slam_observer_ros.tracking.slip import MapViews, Slip, Standing
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.step import step
 
@@ -91,7 +91,8 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._new_landmarks = NewLandmarks()
-        self._standing, self._drift = Standing(), Drift()
+        self._standing = Standing()
+        self._views: MapViews | None = None  # where the robot is in a map
         self._velocities: VelocityHistory | None = None  # along which they were moved
         self._delay_evidence = DelayEvidence()
         self._present: Ambiguity | None = None
@@ -143,7 +144,7 @@ class Hypotheses:
 
     def prune_to_best(self) -> State:
         """Give up all hypotheses but the most likely one, and return its state."""
-        self._drift.clear()
+        self._views = None
         self._all = self._all[:1]
         return self.best
 
@@ -258,12 +259,14 @@ class Hypotheses:
             variances = state.advance(flat, start_ns, end_ns)
             if state is not self.best:
                 continue
-            self._standing.moved.append(se3.between(before, state.observer.A))
+            standing = self._standing
+            standing.before, standing.pose = (
+                standing.pose,
+                standing.pose.dot(se3.between(before, state.observer.A)),
+            )
             calibration = state.calibration
             if calibration.delay_error_ns:
                 self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
-        if len(self._standing.moved) > MAX_MOTIONS:
-            self._standing.clear_time()
         self._velocities = velocities
 
     @property
@@ -281,7 +284,7 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.state.clear_time()
         self._standing.clear_time()
-        self._drift.clear()
+        self._views = None
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
@@ -306,42 +309,25 @@ class Hypotheses:
         """Use an observation made at their instant; return what it did to the best one."""
         standing = self._standing
         if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
-            self._judge(event)
+            self._judge_standing(event)
         if standing.excluded:
             is_carried = np.isin(event.ids, list(standing.excluded))
             for hypothesis in self._all:
                 counts = hypothesis.state.counts
                 counts.note(Reason.CARRIED, event.ids[is_carried], event.stamp_ns)
             event = event.select(~is_carried)
-        if self._drift.is_followed:
-            best = self.best
-            self._drift.before = best.observer.pose.copy(), best.known_errors.pose_covariance()
         update = self._observe(event)
         self._note_ambiguity(event)
         return update
 
-    def follow_drift(
-        self,
-        event: ObservationEvent,
-        update: Update,
-        known_ids: IntArray,
-        known_covariances: FloatArray | None,
-    ) -> bool:
-        """Let the pose be uncertain if an observation and those before it contradict it.
+    def judge_views(self, ids: IntArray, covariances: FloatArray | None) -> bool:
+        """Let the pose be less sure where views of a map contradict it; return whether they do.
 
-        By the landmarks of a loaded map, as :meth:`.Drift.note`; return whether they do.
+        Landmarks ``ids`` (n,) are in the map, with ``covariances`` (n, 3, 3) or none.
         """
-        best, drift = self.best, self._drift
-        if not self._can_weigh:
-            return False
-        explained = drift.note(best, event, update, known_ids, known_covariances)
-        if explained is None:
-            return False
-        for hypothesis in self._all:
-            state = hypothesis.state
-            state.slip(state.observer.A, explained)
-            state.counts['slip'] += drift.has_strayed
-        return True
+        if self._views is None and self._can_weigh:
+            self._views = MapViews(self.best.axes, ids, covariances)
+        return self._views is not None and self._take(self._views.contradiction(self.best))
 
     def _note_ambiguity(self, event: ObservationEvent) -> None:
         """Note whether points without ids fit several maps, after an observation."""
@@ -374,24 +360,27 @@ class Hypotheses:
         spread = L @ (mixed[pose, pose] + least * np.eye(self.best.axes.p)) @ L.T
         return float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
 
-    def _judge(self, event: ObservationEvent) -> None:
+    def _judge_standing(self, event: ObservationEvent) -> None:
         """Stop where the wheels spin, and give up landmarks that the robot carries."""
         standing, best = self._standing, self.best
         if not self._can_weigh or self._velocities is None:
             return
-        was_slipping, were_carried = standing.slip is not None, standing.carried
-        lost = standing.note(best, event, self._velocities)
-        newly = standing.carried - were_carried
-        for hypothesis in self._all:
-            state = hypothesis.state
-            if lost is not None:
-                take_back(state, lost)
-                state.counts['slip'] += not was_slipping
-            if newly:
+        were_carried = standing.carried
+        self._take(standing.note(best, event, self._velocities))
+        if newly := standing.carried - were_carried:
+            for state in self.states:
                 state.counts.note(Change.CARRIED, np.array(sorted(newly)), event.stamp_ns)
         if best.is_mapping:
             for landmark_id in newly:
                 self.forget(landmark_id)
+
+    def _take(self, slip: Slip | None) -> bool:
+        """Let all hypotheses slip, if that is so; return whether it is."""
+        if slip is not None:
+            for state in self.states:
+                state.slip(state.observer.A @ slip.motion, slip.covariance)
+                state.counts['slip'] += slip.is_new
+        return slip is not None
 
     def _observe(self, event: ObservationEvent) -> Update:
         """Use an observation of places."""
@@ -401,10 +390,16 @@ class Hypotheses:
         is_clear = len(self._all) == 1 and not unknown and not may_name(self.best, event.ids)
         if is_clear or not self._can_weigh:
             may_refuse = self._can_weigh and self._limit > 1
+            if self._views is not None:
+                self._views.add(self.best, event)
             if (update := step(self.best, event, may_refuse)) is not None:
                 return update
         # All hypotheses with all meanings; costs are differences to the most likely one.
-        children = self._follow(event, self._interpret(event))
+        possible = self._interpret(event)
+        number, likeliest = possible[0]
+        if self._views is not None and not number and likeliest.slipped is None:
+            self._views.add(self.best, likeliest.event)
+        children = self._follow(event, possible)
         least_cost = children[0].hypothesis.cost
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:

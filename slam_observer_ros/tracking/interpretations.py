@@ -13,9 +13,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.filter.observer import Residuals
-from slam_observer_ros.filter.robust import accepted
-from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.tracking.assignments import Assignment, find_assignments
 from slam_observer_ros.tracking.costs import (
     outlier_cost,
@@ -30,7 +27,7 @@ from slam_observer_ros.tracking.matching import (
     match,
     MatchedObservation,
 )
-from slam_observer_ros.tracking.slip import astray, slip
+from slam_observer_ros.tracking.slip import astray, rejects, second_track
 from slam_observer_ros.tracking.state import State
 
 
@@ -71,7 +68,7 @@ def interpretations(
     event = calibrated(state, event)
     matched, some_are_unknown = match(state, event), bool((event.ids == UNKNOWN_ID).any())
     if not some_are_unknown:
-        rejected = _are_rejected(state, matched.residuals)
+        rejected = rejects(state, matched)
         if is_contradiction(rejected):
             return _rejected_or_slipped(state, matched, event, rejected)
     if some_are_unknown or may_name(state, event.ids):
@@ -106,8 +103,8 @@ def _rejected_or_slipped(
     residuals, m = matched.residuals, len(event.ids)
     cost, is_new_cause = rejection_cost(state, matched, rejected)
     accepted_cost = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
-    after_slip = _after_slip(state, matched, event) if is_new_cause else None
     rejecting = Interpretation(event, accepted_cost + cost)
+    after_slip = _after_slip(state, matched, event) if is_new_cause else None
     if after_slip is None:
         return [rejecting]
     if state.was_contradicted:
@@ -122,18 +119,9 @@ def _after_slip(
     state: State, matched: MatchedObservation, event: ObservationEvent
 ) -> Interpretation | None:
     """Take the robot for slipped; return None if that does not explain all of it."""
-    settings = state.settings
-    if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
+    if (track := second_track(state, matched, event)) is None:
         return None
-    stands = state.observation_noise.stood_s > 0.0
-    far = beyond_driving(matched.known.points, matched.residuals.r, settings)
-    if stands and not far.all():
-        return None
-    slipped = state.copy()
-    cost = slip(slipped, matched)
-    matched = match(slipped, event)
-    if _are_rejected(slipped, matched.residuals).any():
-        return None
+    slipped, matched, cost = track
     cost += SLIP_COST + pairing_cost(slipped, len(event.ids), matched.residuals)
     return Interpretation(event, cost, slipped)
 
@@ -164,12 +152,6 @@ def _slips_without_ids(
                 evidence, cost = assignment.evidence, slipped.cost - spared
                 slips[taken_for] = replace(slipped, cost=cost, evidence=evidence)
     return list(slips.values())
-
-
-def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
-    """Return which points (m,) the gate rejects."""
-    gate = state.settings.rejection_threshold
-    return ~accepted(state.gains.distances(residuals), gate)
 
 
 def _with_ids(
