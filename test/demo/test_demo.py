@@ -61,7 +61,7 @@ def _summary(output, name):
 def test_demo_converges_and_leaves_figures_and_a_recording(tmp_path):
     (tmp_path / 'run_1').mkdir()
     # No faster than people run it: where velocities come long before landmarks, L seems to lag.
-    code, output = run_demo(tmp_path, '--duration', '70')
+    code, output = run_demo(tmp_path, '--duration', '62')
     assert code == 0, output
     assert _summary(output, 'log10 L at 60 s') < -10.0
     assert _summary(output, 'slope of log10 L') == pytest.approx(-0.217, abs=0.005)
@@ -71,7 +71,7 @@ def test_demo_converges_and_leaves_figures_and_a_recording(tmp_path):
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with AnyReader([folder / 'recording.mcap'], default_typestore=typestore) as recording:
         counts = {topic: info.msgcount for topic, info in recording.topics.items()}
-    assert counts['/twist'] == counts['/landmarks'] == counts['/ground_truth/pose'] == 1401
+    assert counts['/twist'] == counts['/landmarks'] == counts['/ground_truth/pose'] == 1241
     assert min(counts['/observer_node/odometry'], counts['/lyapunov']) > 100
     assert {'/landmark_map', '/markers', '/path', '/diagnostics', '/landmark_estimates'} <= set(
         counts

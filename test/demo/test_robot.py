@@ -162,7 +162,7 @@ def test_distances_are_3_percent_long_and_one_in_five_is_through_a_wall():
     assert np.mean(off_m < -4.0 * hall.RANGE_NOISE_M) < 1e-3
 
 
-@pytest.mark.parametrize('file', ['apriltags', 'tags_on_tf', 'reflectors', 'wheeled_robot'])
+@pytest.mark.parametrize('file', ['tags_on_tf', 'reflectors', 'wheeled_robot'])
 def test_a_mount_that_is_five_degrees_off_is_named_and_estimated(file):
     mount = se3.from_rpy((0.0, 0.0, 0.0, 0.0, 0.0, np.radians(5.0)))
     drive = Drive(file, mount=mount, localization_mode='uncertain')

@@ -14,7 +14,7 @@ from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PERIOD_NS = 100_000_000
-SIZES = (1e-300, 1e-30, 1e-12, 1.0, 1e6, 1e12, 1e30, 1e300)
+SIZES = (1e-300, 1e-12, 1.0, 1e6, 1e12, 1e300)
 WORLD = np.array(
     [[4.0, 1.0, 0.3], [-2.0, 3.0, 0.0], [1.0, -5.0, 0.6], [6.0, 4.0, 0.1], [-4.0, -3.0, 0.4]]
 )
