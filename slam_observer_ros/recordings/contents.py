@@ -18,15 +18,15 @@ from slam_observer_ros.events import AngularVelocityEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import CLOUDS, ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import APRILTAGS, no_tags, observed_tags, POSE_ARRAY
 from slam_observer_ros.messages.poses import decode_odometry, ODOMETRY, TRANSFORMS
-from slam_observer_ros.recordings.decoding import (
+from slam_observer_ros.recordings.event_builder import OdometryCheck
+from slam_observer_ros.recordings.sources import MessageSource, RawMessage, Topic
+from slam_observer_ros.recordings.topics import (
     Decode,
     decode_pose,
     decode_transform_message,
     input_decoders,
+    SelectedTopics,
 )
-from slam_observer_ros.recordings.event_builder import OdometryCheck
-from slam_observer_ros.recordings.sources import MessageSource, RawMessage, Topic
-from slam_observer_ros.recordings.topics import SelectedTopics
 from slam_observer_ros.settings.node_settings import InputSettings
 
 MAX_EMPTY_CLOUDS = 1000

@@ -21,15 +21,6 @@ from slam_observer_ros.messages.detections import decode_camera_info
 from slam_observer_ros.messages.poses import PoseBlock
 from slam_observer_ros.messages.registry import BlockDecoder
 from slam_observer_ros.recordings.contents import Arrivals, Contents
-from slam_observer_ros.recordings.decoding import (
-    block_decoder,
-    Decode,
-    decode_landmarks,
-    decode_pose,
-    decode_pose_block,
-    decode_transform_message,
-    input_decoders,
-)
 from slam_observer_ros.recordings.event_builder import (
     drop_reason,
     DropError,
@@ -46,6 +37,13 @@ from slam_observer_ros.recordings.sources import (
     Topic,
 )
 from slam_observer_ros.recordings.topics import (
+    block_decoder,
+    Decode,
+    decode_landmarks,
+    decode_pose,
+    decode_pose_block,
+    decode_transform_message,
+    input_decoders,
     select_topics,
     SelectedTopics,
     TopicNames,

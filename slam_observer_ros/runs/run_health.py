@@ -22,10 +22,9 @@ from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.estimates import DELAY_NAME, Innovations, point_share, Reason
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.recordings.decoding import input_decoders
 from slam_observer_ros.recordings.event_builder import NO_TRANSFORM
 from slam_observer_ros.recordings.reader import Recording
-from slam_observer_ros.recordings.topics import SelectedTopics
+from slam_observer_ros.recordings.topics import input_decoders, SelectedTopics
 from slam_observer_ros.recordings.trajectory import interpolate
 from slam_observer_ros.runs.health import (
     MAX_UNMAPPED,

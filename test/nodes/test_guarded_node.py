@@ -29,7 +29,7 @@ import sys
 import numpy as np
 from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.nodes.observer_core import ObserverCore
+from slam_observer_ros.nodes.observer_nodes import ObserverCore
 from slam_observer_ros.nodes.executables import observer_node
 from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.services import ControlServices

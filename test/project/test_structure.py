@@ -34,7 +34,7 @@ def sources():
 
 
 def test_folders_show_the_architecture(structure):
-    assert len(structure.modules()) <= 162
+    assert len(structure.modules()) <= 160
     assert len(structure.loose_modules()) <= 5
     assert structure.layers() <= 12
     assert len(structure.longest_chain()) <= 19
