@@ -40,9 +40,15 @@ NESTED = f'{"=" * 80}\nMSG: '
 def decode_isaac_apriltags(reader: CdrReader) -> ObservationEvent:
     """Read an AprilTagDetectionArray of isaac_ros_apriltag_interfaces, which has the poses."""
     stamp_ns, frame_id = reader.header()
-    tags = [_read_isaac_apriltag(reader) for _ in range(reader.uint32())]
-    ids = np.array([tag_id for tag_id, _ in tags], dtype=np.int64)
-    values = np.array([pose for _, pose in tags]).reshape(-1, _POSE + _COVARIANCE)
+    numbers, poses = [], []
+    for _ in range(reader.uint32()):
+        reader.string()  # family
+        numbers.append(reader.int32())
+        reader.float64(_CENTRE_AND_CORNERS)
+        reader.header()
+        poses.append(reader.float64(_POSE + _COVARIANCE))
+    ids = np.array(numbers, dtype=np.int64)
+    values = np.array(poses).reshape(-1, _POSE + _COVARIANCE)
     covariances = values[:, _POSE:].reshape(-1, 6, 6)
     return observed_poses(frame_id, stamp_ns, _usable(ids), values[:, :_POSE], covariances)
 
@@ -130,15 +136,6 @@ def orientations_of(quaternions: FloatArray) -> FloatArray | None:
     R = np.zeros((len(quaternions), 3, 3))
     R[known] = so3.from_quaternion(quaternions[known])
     return R
-
-
-def _read_isaac_apriltag(reader: CdrReader) -> tuple[int, FloatArray]:
-    """Read an AprilTagDetection: id, and pose with covariance (43,) in the frame of the array."""
-    reader.string()  # family
-    tag_id = reader.int32()
-    reader.float64(_CENTRE_AND_CORNERS)
-    reader.header()
-    return tag_id, reader.float64(_POSE + _COVARIANCE)
 
 
 def _usable(ids: IntArray) -> IntArray:

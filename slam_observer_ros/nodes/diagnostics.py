@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Bool
 
@@ -21,7 +20,6 @@ from slam_observer_ros.common.findings import (
     worst_first,
 )
 from slam_observer_ros.common.stamps import to_ns
-from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event
@@ -34,51 +32,15 @@ from slam_observer_ros.runs.health import (
     estimator_values,
     InputNumbers,
     localisation,
+    NoiseFit,
     of_all_learnt,
-    of_fit,
     of_node,
     Progress,
 )
 from slam_observer_ros.runs.mistakes import Drive, Search
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
-RECENT_INNOVATIONS = (
-    300  # observations over which innovations are compared with the noise that is stated
-)
-MIN_DEGREES = 100  # of freedom, that it takes to say so; the factor is then known to 7 %
 FOUND_AGAIN = 0.8  # of the error level: near it the robot would be lost and found all the time
-
-
-class NoiseFit:
-    """Compares the innovations of late with the noise that is stated."""
-
-    def __init__(self) -> None:
-        self._recent: deque[tuple[float, int]] = deque(maxlen=RECENT_INNOVATIONS)
-
-    def add(self, update: Update) -> None:
-        """Count an observation, if the gains know what was to be expected of it."""
-        innovation = update.innovation
-        if innovation is not None and innovation.nis is not None:
-            self._recent.append((innovation.nis, innovation.degrees_of_freedom))
-
-    @property
-    def factor(self) -> float | None:
-        """How many times as large as stated innovations are; None while that is not known."""
-        degrees = sum(each for _, each in self._recent)
-        if degrees < MIN_DEGREES:
-            return None
-        return float(np.sqrt(sum(nis for nis, _ in self._recent) / degrees))
-
-    @property
-    def findings(self) -> list[Finding]:
-        """What is wrong with the noise that is stated."""
-        return of_fit(self.factor)
-
-    def __str__(self) -> str:
-        """Return the factor, and what is wrong with the noise by it."""
-        if self.factor is None:
-            return 'not known yet'
-        return f'{self.factor:.2f}' + ''.join(f' ({each.what})' for each in self.findings)
 
 
 class LocalisationStatus:
@@ -255,18 +217,16 @@ class DiagnosticsPublisher:
         now_s = time.monotonic()
         if new['observed_point']:
             self._seen_s = now_s
-        symptoms = of_node(
-            self._estimator,
-            self._numbers(self._new('malformed', malformed)),
-            Progress(
-                dropped,
-                new,
-                self._new('unstamped', self._feed.unstamped),
-                sum(self._recent_counts, Counter()),
-                is_paused=self._feed.is_paused,
-                has_seen=self._seen_s is not None,
-            ),
+        progress = Progress(
+            dropped,
+            new,
+            self._new('unstamped', self._feed.unstamped),
+            sum(self._recent_counts, Counter()),
+            is_paused=self._feed.is_paused,
+            has_seen=self._seen_s is not None,
         )
+        unreadable = self._numbers(self._new('malformed', malformed))
+        symptoms = of_node(self._estimator, unreadable, progress)
         for finding in symptoms:
             if finding.kind == 'empty_messages' and not self._said_empty:
                 self._said_empty = True
@@ -279,13 +239,7 @@ class DiagnosticsPublisher:
             reasons = [*of_both, *of_all_learnt(self._estimator)]
             self._watch.look(reasons, has_slipped=new['slip'] > 0)
         findings = explained([*self._watch.findings, *symptoms])
-        level = max((finding.level for finding in findings), default=Level.NOTE)
-        used = new['velocity'] + new['observation']
-        if dropped and not used and not self._feed.is_paused:
-            level = Level.ERROR
         problems = worst_first(findings, self._faults())
-        if problems:
-            level = max(level, Level.WARNING)
         self._since_s = {each.kind: self._since_s.get(each.kind, now_s) for each in findings}
         values = self._input_values(now_s - self._last_time_s)
         self._last_time_s = now_s
@@ -296,7 +250,7 @@ class DiagnosticsPublisher:
         values |= {f'problem {i}': problem for i, problem in enumerate(problems, start=1)}
         values |= {f'{kind}, for [s]': f'{now_s - t:.0f}' for kind, t in self._since_s.items()}
         status = DiagnosticStatus(
-            level=bytes([level]),
+            level=bytes([progress.level(findings, problems)]),
             name=f'{self._node.get_fully_qualified_name().lstrip("/")}: estimate',
             hardware_id=self._hardware_id,
             message=in_brief(problems) or 'running',

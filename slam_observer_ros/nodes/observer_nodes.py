@@ -26,7 +26,6 @@ from slam_observer_ros.nodes.diagnostics import (
     DiagnosticsPublisher,
     LocalisationStatus,
     MistakeWatch,
-    NoiseFit,
 )
 from slam_observer_ros.nodes.estimate_publisher import EstimatePublisher, TOPICS
 from slam_observer_ros.nodes.estimator_feed import EstimatorFeed
@@ -45,6 +44,7 @@ from slam_observer_ros.nodes.ros_node import (
 from slam_observer_ros.nodes.services import ControlServices, MapServices, NamedMapServices
 from slam_observer_ros.nodes.transforms import LiveTransforms, TransformedOdometry
 from slam_observer_ros.recordings.frames import BaseFrame, TransformBuffer
+from slam_observer_ros.runs.health import NoiseFit
 from slam_observer_ros.runs.mistakes import Search
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ManagedNodeSettings, ObserverNodeSettings
@@ -356,7 +356,14 @@ class LifecycleBond:
         self._period_s = heartbeat_period_s
         self._bond: Any = None
         if heartbeat_period_s:
-            self._bond_class = _bond_class()
+            try:
+                from bondpy.bondpy import Bond
+            except ImportError as error:
+                raise ParameterError(
+                    f"'bond_heartbeat_period' needs bondpy: {install_command('bondpy')}; or set "
+                    'it to 0, and bond_timeout of the lifecycle manager to 0.0'
+                ) from error
+            self._bond_class = Bond
 
     def start(self) -> None:
         """Begin with the heartbeats, if they were asked for."""
@@ -372,17 +379,6 @@ class LifecycleBond:
         if self._bond is not None:
             self._bond.shutdown()
             self._bond = None
-
-
-def _bond_class() -> Any:
-    try:
-        from bondpy.bondpy import Bond
-    except ImportError as error:
-        raise ParameterError(
-            f"'bond_heartbeat_period' needs bondpy: {install_command('bondpy')}; or set it to 0, "
-            'and bond_timeout of the lifecycle manager to 0.0'
-        ) from error
-    return Bond
 
 
 class ObserverNode(RepeatableParameters):

@@ -383,16 +383,12 @@ class _Graph:
         for kind, first, second, numbers in edges:
             if kind in _OF_POINTS:
                 self._add_point(kind, first, second, numbers)
+            elif second != following.get(first):
+                self.left_out[LOOP_CLOSURE] += 1
+            elif first in self.motions:
+                self.left_out[REPEATED] += 1
             else:
-                self._add_motion(first, second, following.get(first), numbers[:3])
-
-    def _add_motion(self, first: int, second: int, after: int | None, motion: FloatArray) -> None:
-        if second != after:
-            self.left_out[LOOP_CLOSURE] += 1
-        elif first in self.motions:
-            self.left_out[REPEATED] += 1
-        else:
-            self.motions[first] = motion
+                self.motions[first] = numbers[:3]
 
     def _add_point(self, kind: str, pose: int, landmark_id: int, numbers: FloatArray) -> None:
         if landmark_id in self.points[pose]:

@@ -12,11 +12,10 @@ from itertools import islice
 from pathlib import Path, PurePath
 import re
 from tempfile import TemporaryDirectory
-from typing import Any, Final, NamedTuple, TYPE_CHECKING
+from typing import Any, Final, TYPE_CHECKING
 
 from slam_observer_ros.common.errors import message_of, RecordingError, YamlError
 from slam_observer_ros.common.files import load_yaml, not_special, plain_value
-from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.recordings.mcap_source import McapSource
 from slam_observer_ros.recordings.sources import (
     by_key,
@@ -71,7 +70,11 @@ class BagSource(MessageSource):
             of_connection = {c.id: self._topic(c) for c in wanted}
             for connection, stamp_ns, data in self._reader.messages(wanted):
                 topic = of_connection[connection.id]
-                yield RawMessage(topic, stamp_ns, self._cdr(topic, data))
+                if self._ros1 is not None:
+                    converted = self._ros1.to_cdr(data, topic.message_type, topic.definition)
+                    yield RawMessage(topic, stamp_ns, converted)
+                else:
+                    yield RawMessage(topic, stamp_ns, data)
 
     def close(self) -> None:
         """Close the file."""
@@ -79,13 +82,6 @@ class BagSource(MessageSource):
 
     def _topic(self, connection: Connection) -> Topic:
         return self._topics[_part(connection).key]
-
-    def _cdr(self, topic: Topic, data: bytes) -> Buffer:
-        return (
-            data
-            if self._ros1 is None
-            else self._ros1.to_cdr(data, topic.message_type, topic.definition)
-        )
 
 
 def _part(connection: Connection) -> Topic:
@@ -142,13 +138,6 @@ _BLOCK_BYTES = 1 << 20
 _NONE_LEFT = 'no whole message is left'
 
 
-class _Metadata(NamedTuple):
-    """Names of the files of a recording, and how many messages it has; none if it is damaged."""
-
-    names: tuple[str, ...] = ()
-    message_count: int = 0
-
-
 def open_source(path: Path) -> tuple[MessageSource, str | None]:
     """Open a .mcap, .db3 or .bag file or a rosbag2 directory.
 
@@ -193,15 +182,15 @@ def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
         return open_source(_only_file(path))
     if not metadata.is_file():
         raise RecordingError(f'{metadata} is no file')
-    stated = _read_metadata(path)
-    found = [_existing(path / name) for name in stated.names]
+    names, stated_count = _read_metadata(path)
+    found = [_existing(path / name) for name in names]
     files = [file for file in found if file is not None]
     if not files:  # renamed, or the metadata is damaged
         files = [_only_file(path, 'that metadata.yaml does not list')]
-    missing = [name for name, file in zip(stated.names, found, strict=True) if file is None]
-    if len(stated.names) < 2:
+    missing = [name for name, file in zip(names, found, strict=True) if file is None]
+    if len(names) < 2:
         missing = []
-    source, warning = _open_parts(path, files, missing, stated.message_count)
+    source, warning = _open_parts(path, files, missing, stated_count)
     stems = {file.name.removesuffix(COMPRESSED) for file in files}
     others = [f.name for f in _storage_files(path) if f.name.removesuffix(COMPRESSED) not in stems]
     if others:  # as after a power cut, or put there by hand
@@ -242,18 +231,21 @@ def _open_parts(
     return source, '; '.join(warnings) or None
 
 
-def _read_metadata(directory: Path) -> _Metadata:
-    """Read metadata.yaml; raise a RecordingError if it can't be read or has too many bytes."""
+def _read_metadata(directory: Path) -> tuple[list[str], int]:
+    """Return the names of a recording's files and its number of messages; none if damaged.
+
+    Raise a RecordingError if metadata.yaml can't be read or has too many bytes.
+    """
     try:
         content = load_yaml(directory / 'metadata.yaml', MAX_METADATA_BYTES, plain_value)
         stated = content['rosbag2_bagfile_information']
-        names = tuple(PurePath(name).name for name in stated['relative_file_paths'])
+        names = [PurePath(name).name for name in stated['relative_file_paths']]
         count = stated.get('message_count')
-        return _Metadata(names, count if type(count) is int else 0)
+        return names, count if type(count) is int else 0
     except OSError as error:
         raise RecordingError(f'{directory}: can not read metadata.yaml: {error}') from error
     except (YamlError, ValueError, LookupError, TypeError, AttributeError):
-        return _Metadata()
+        return [], 0
 
 
 def _only_file(directory: Path, why: str = 'without metadata.yaml') -> Path:

@@ -28,6 +28,7 @@ from slam_observer_ros.estimates import (
     point_share,
     RangePower,
     Reason,
+    Update,
 )
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.lie.matrices import MAX_DEVIATION
@@ -273,6 +274,45 @@ def of_fit(factor: float | None) -> list[Finding]:
     ]
 
 
+RECENT_INNOVATIONS = 300
+"""Observations over which innovations are compared with the noise that is stated."""
+
+MIN_DEGREES = 100
+"""Degrees of freedom that it takes to say so; the factor is then known to 7 %."""
+
+
+class NoiseFit:
+    """Compares the innovations of late with the noise that is stated."""
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[float, int]] = deque(maxlen=RECENT_INNOVATIONS)
+
+    def add(self, update: Update) -> None:
+        """Count an observation, if the gains know what was to be expected of it."""
+        innovation = update.innovation
+        if innovation is not None and innovation.nis is not None:
+            self._recent.append((innovation.nis, innovation.degrees_of_freedom))
+
+    @property
+    def factor(self) -> float | None:
+        """How many times as large as stated innovations are; None while that is not known."""
+        degrees = sum(each for _, each in self._recent)
+        if degrees < MIN_DEGREES:
+            return None
+        return float(np.sqrt(sum(nis for nis, _ in self._recent) / degrees))
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What is wrong with the noise that is stated."""
+        return of_fit(self.factor)
+
+    def __str__(self) -> str:
+        """Return the factor, and what is wrong with the noise by it."""
+        if self.factor is None:
+            return 'not known yet'
+        return f'{self.factor:.2f}' + ''.join(f' ({each.what})' for each in self.findings)
+
+
 def of_rejections(counts: Counter[str], when: str = '') -> list[Finding]:
     """Judge whether more points or orientations were rejected than are outliers, or say little."""
     names = ('rejected_landmark', 'rejected_orientation', 'vague_point')
@@ -348,6 +388,14 @@ class Progress:
     lately: Counter[str]
     is_paused: bool
     has_seen: bool  # any landmark, ever
+
+    def level(self, findings: Iterable[Finding], problems: Sequence[str]) -> Level:
+        """Return how bad a node's state is; all that came in vain is an error."""
+        level = max((finding.level for finding in findings), default=Level.NOTE)
+        used = self.counts['velocity'] + self.counts['observation']
+        if self.dropped and not used and not self.is_paused:
+            return Level.ERROR
+        return max(level, Level.WARNING) if problems else level
 
 
 def of_node(

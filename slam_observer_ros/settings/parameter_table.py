@@ -85,7 +85,9 @@ class Parameter:
             if value is False and 'off' in self.choices:
                 value = 'off'  # YAML 1.1 reads off as false
             self._expect(value, isinstance(value, str), 'a string')
-            return self._choice(str(value))
+            is_choice = not self.choices or value in self.choices
+            self._expect(value, is_choice, f'one of {", ".join(self.choices)}')
+            return str(value)
         return self._vector(value, len(default))
 
     def range_text(self) -> str:
@@ -113,11 +115,6 @@ class Parameter:
     def _in_range(self, value: float) -> float:
         in_range = self.minimum <= value <= self.maximum
         self._expect(value, in_range, f'a value {self.range_text()}')
-        return value
-
-    def _choice(self, value: str) -> str:
-        is_choice = not self.choices or value in self.choices
-        self._expect(value, is_choice, f'one of {", ".join(self.choices)}')
         return value
 
     def _vector(self, value: object, length: int) -> tuple[float, ...]:

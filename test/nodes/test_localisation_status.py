@@ -13,8 +13,9 @@ from robots import Robot
 from std_msgs.msg import Bool
 
 from slam_observer_ros.estimates import NormalisedInnovation
-from slam_observer_ros.nodes.diagnostics import LocalisationStatus, NoiseFit
+from slam_observer_ros.nodes.diagnostics import LocalisationStatus
 from slam_observer_ros.nodes.ros_node import LATCHED_QOS
+from slam_observer_ros.runs.health import NoiseFit
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.simulation import Scenario
 
