@@ -100,8 +100,8 @@ WINDOWS_S = np.array([0.3, 1.0, 3.0])
 UNLIKELY = {3: 36.0, 6: 44.0}
 """χ² of p axes beyond which views contradict a pose that is surer than they are.
 
-Of honest noise one in ten million is: it takes hundreds of hours. Noise twice as large as stated
-is more often, and costs little, as the pose only becomes less sure.
+Of honest noise one in ten million is. Noise twice as large as stated, or a map taken as exact,
+exceed them more often; that costs little, as the pose only becomes less sure.
 """
 
 STRAYED = 144.0
