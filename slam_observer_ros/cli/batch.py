@@ -225,7 +225,11 @@ def run(args: argparse.Namespace) -> None:
             show_message('warning', 'Stopped; the same command goes on from here.')
             raise
         finally:
-            write_failures(failed_file, failures)
+            if failures:
+                with unfinished_file(failed_file) as file:
+                    file.writelines(json_text(failure) + '\n' for failure in failures)
+            else:
+                failed_file.unlink(missing_ok=True)
             with muted_warnings():  # which were shown before
                 lines = read_logs(args.out)
             write_index(args.out, lines, args.score)
@@ -396,15 +400,6 @@ def opened_log(path: Path) -> Iterator[Callable[[Mapping[str, object]], None]]:
                 os.fsync(file.fileno())
 
         yield append
-
-
-def write_failures(path: Path, failures: Iterable[Mapping[str, object]]) -> None:
-    """Write the runs that failed, a line each; without any there is no such file."""
-    if not (lines := [json_text(failure) + '\n' for failure in failures]):
-        path.unlink(missing_ok=True)
-        return
-    with unfinished_file(path) as file:
-        file.writelines(lines)
 
 
 def _runs_of(path: Path) -> Iterator[Line]:

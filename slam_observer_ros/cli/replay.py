@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 import logging
 import math
@@ -41,7 +41,7 @@ from slam_observer_ros.recordings.trajectory import write_tum
 from slam_observer_ros.report.page import write_report
 from slam_observer_ros.report.summary import as_json, identity, summary_rows
 from slam_observer_ros.runs.replay import result_of
-from slam_observer_ros.runs.result import Result, Sighting
+from slam_observer_ros.runs.result import Result
 from slam_observer_ros.settings.node_settings import InputSettings
 
 logger = logging.getLogger(__name__)
@@ -126,8 +126,13 @@ def run(args: argparse.Namespace) -> None:
         print_json(figures)
     else:
         print_table(str(args.recording), rows | written)
-        if life:
-            _print_life(args.explain, life)
+        lines = []
+        for each in life:
+            known = (f'{each.sigmas:.2f}', f'{each.residual_m:.3f}')
+            residual = ('–', '–') if math.isnan(each.sigmas) else known
+            lines.append((f'{each.seconds:9.3f}  {each.what}', *residual))
+        if lines:
+            print_columns(f'landmark {args.explain}', ('time, s', 'residual, σ', 'm'), lines)
     if errors:
         raise OutputError('; '.join(errors))
     if args.explain is not None and not life:
@@ -140,16 +145,6 @@ def run(args: argparse.Namespace) -> None:
         raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')
     if args.strict and result.unused_input:
         raise LossError(f'{args.recording}: --strict does not allow this: {result.unused_input}')
-
-
-def _print_life(landmark_id: int, life: Sequence[Sighting]) -> None:
-    """Print what came of each observation of a landmark, and of the landmark itself."""
-    lines = []
-    for each in life:
-        has_residual = not math.isnan(each.sigmas)
-        residual = (f'{each.sigmas:.2f}', f'{each.residual_m:.3f}') if has_residual else ('–', '–')
-        lines.append((f'{each.seconds:9.3f}  {each.what}', *residual))
-    print_columns(f'landmark {landmark_id}', ('time, s', 'residual, σ', 'm'), lines)
 
 
 def _check_files(args: argparse.Namespace, config: Path | None) -> None:

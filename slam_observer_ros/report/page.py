@@ -119,6 +119,10 @@ def report_data(result: Result) -> dict[str, Json]:
     true_landmarks = None
     if (truth := result.aligned_landmarks) is not None:
         true_landmarks = {'ids': truth.ids.tolist(), 'xyz': rounded(truth.world_points.T, 3)}
+    # The plan alone is drawn of what is flat.
+    points = [result.run.trajectory.positions, *(i.world_points for i in result.instants[-1:])]
+    extents = np.ptp(np.concatenate(points), axis=0) if len(points[0]) else np.zeros(3)
+    width, depth, height = extents
     # Messages dropped until each instant
     reasons = sorted({reason for instant in result.instants for reason in instant.dropped})
     return {
@@ -131,7 +135,7 @@ def report_data(result: Result) -> dict[str, Json]:
             ['Python', sys.version.split()[0]],
             ['numpy', np.__version__],
         ],
-        'is_flat': _is_flat(result),
+        'is_flat': bool(height <= FLAT * max(width, depth)),
         'gaps': rounded(result.gaps_s, 2),
         'path': _path(result),
         'instants': _instants(result),
@@ -149,14 +153,6 @@ def report_data(result: Result) -> dict[str, Json]:
             for reason in reasons
         ],
     }
-
-
-def _is_flat(result: Result) -> bool:
-    points = [result.run.trajectory.positions]
-    if result.instants:
-        points.append(result.instants[-1].world_points)
-    extent = np.ptp(np.concatenate(points), axis=0) if len(points[0]) else np.zeros(3)
-    return bool(extent[2] <= FLAT * max(extent[0], extent[1]))
 
 
 def _path(result: Result) -> dict[str, Json]:

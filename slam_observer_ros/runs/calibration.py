@@ -394,6 +394,11 @@ class CalibrationFinder:
                 uncertain = math.hypot(part.deviation, part.value * shares[part.name])
                 part = replace(part, deviation=min(uncertain, part.stated))
             parts.append(part)
+        # Scales of velocities that move, but are so noisy that it would not show.
+        widths = np.array([*self._open.angular_scale_stddev, *self._open.linear_scale_stddev])
+        hidden = (self._motion.noise_share < MOSTLY_NOISE) & (widths == 0.0)
+        possible = np.arange(6)[axes_of(settings.two_d_mode).pose]
+        too_noisy = {names[i] for i in possible if hidden[i]}
         return Found(
             parts,
             smoothed.calibration_correlations,
@@ -402,17 +407,8 @@ class CalibrationFinder:
             depth_gain,
             noise,
             estimator.motion_factors,
-            self._too_noisy(),
+            sorted(name for name in too_noisy if f'{name[:-2]}_stddev' not in self._kept),
         )
-
-    def _too_noisy(self) -> list[str]:
-        """Return the scales of velocities that move, but are so noisy that it would not show."""
-        share, stated = self._motion.noise_share, self._open
-        widths = np.array([*stated.angular_scale_stddev, *stated.linear_scale_stddev])
-        hidden = (share < MOSTLY_NOISE) & (widths == 0.0)
-        possible = np.arange(6)[axes_of(stated.two_d_mode).pose]
-        names = {OF_VELOCITY[i].name for i in possible if hidden[i]}
-        return sorted(name for name in names if f'{name[:-2]}_stddev' not in self._kept)
 
     def _run(self, settings: Settings) -> tuple[Estimator, Likelihood]:
         self._advance()
