@@ -1,12 +1,17 @@
 """Numpy arrays to ROS messages, each laid out once for what is published and what is recorded.
 
 Stamps are nanoseconds, positions metres, poses (4, 4), body velocities (6,) ordered (Ω, v) in
-rad/s and m/s, ids (n,), points (n, 3).
+rad/s and m/s, covariances (6, 6) ordered (rotation, position), ids (n,), points (n, 3).
+Markers are for RViz and Foxglove. The state itself goes out most often, so it is serialised
+without an object for each part: rclpy's publishers and recordings take these bytes as they are. Of
+each type all but the stamp and a run of float64 is the same in every message, so one is a copy
+of the one before with these replaced.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 import struct
 from typing import Any, TypeAlias
 
@@ -16,9 +21,10 @@ from numpy.typing import NDArray
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import BEARING, MAX_ID, POINT, RANGE, UNKNOWN_ID
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.events import AZIMUTH, BEARING, MAX_ID, POINT, RANGE, UNKNOWN_ID
 from slam_observer_ros.lie import so3
-from slam_observer_ros.messages.cdr import encode_string
+from slam_observer_ros.messages.cdr import ENCAPSULATION_BYTES, encode_string
 from slam_observer_ros.messages.clouds import (
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,
@@ -240,3 +246,341 @@ def _cloud_records(columns: _Columns) -> NDArray[np.void]:
     for name, column in columns.items():
         records[name] = column
     return records
+
+
+PATH_SPACING_NS = 100_000_000
+"""Least time between two poses of the path, nanoseconds."""
+
+POINT_SIZE_M = 0.2
+TEXT_HEIGHT_M = 0.3
+LINE_WIDTH_M = 0.03
+ARROW_LENGTH_M, ARROW_WIDTH_M = 1.0, 0.15
+
+GREEN = (0.0, 0.62, 0.45, 1.0)  # red, green, blue, opacity
+WHITE = (1.0, 1.0, 1.0, 1.0)
+PALE_GREEN = (0.0, 0.62, 0.45, 0.3)
+ORANGE = (0.84, 0.37, 0.0, 1.0)
+
+SKY = (0.34, 0.71, 0.91, 0.8)
+
+MAX_RINGS = 20  # of 36 lines each
+RING = np.linspace(0.0, 2.0 * np.pi, 37)
+
+MAX_LABELS = 200  # more could not be read, and each is a message of its own
+ELLIPSOID_SIGMAS = 3.0  # half axes, in standard deviations
+MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
+
+# Of visualization_msgs/Marker
+ADD, DELETEALL = 0, 3
+ARROW, SPHERE, LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING = 0, 2, 5, 7, 9
+
+
+def half_sights(
+    update: Update, ids: IntArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what was measured of landmarks ``ids`` (n,) at ``points`` (n, 3) by half, metres.
+
+    Of distances (r, 3): x, y of the landmark and the radius, in the plane, of a circle on which
+    the robot is. Of directions (b, 3): the point in that direction that is as far as the landmark.
+    """
+    if update.kinds is None:
+        return np.empty((0, 3)), np.empty((0, 3))
+    _, seen, rows = np.intersect1d(update.ids, ids, return_indices=True)
+    kinds, centres = update.kinds[seen], points[rows]
+    ends = centres + update.residuals[seen]
+    radii = np.linalg.norm((ends - update.pose[:3, 3])[:, :2], axis=1)
+    is_range = kinds == RANGE
+    rings = np.column_stack([centres[is_range, :2], radii[is_range]])
+    return rings, ends[np.isin(kinds, (BEARING, AZIMUTH))]
+
+
+class EstimateMessages:
+    """Makes what says where the robot was and its landmarks are, in ``map_frame``.
+
+    Stamps are nanoseconds, poses (4, 4).
+    """
+
+    def __init__(self, messages: OutgoingMessages, map_frame: str) -> None:
+        self._messages = messages
+        self._map_frame = map_frame
+        self.markers = MarkerMessages(messages, map_frame)
+
+    def path_pose(self, stamp_ns: int, pose: FloatArray) -> Any:
+        """Make one pose of the path."""
+        return self._messages.pose_stamped(stamp_ns, self._map_frame, pose)
+
+    def path(self, stamp_ns: int, poses: Sequence[Any]) -> Any:
+        """Make a nav_msgs/Path of what :meth:`path_pose` has made."""
+        header = self._messages.header(stamp_ns, self._map_frame)
+        return self._messages.make('nav_msgs/msg/Path', header=header, poses=list(poses))
+
+    def landmarks(
+        self,
+        stamp_ns: int,
+        ids: IntArray,
+        world_points: FloatArray,
+        covariances: FloatArray | None,
+        velocities: FloatArray,
+    ) -> Any:
+        """Make a sensor_msgs/PointCloud2 of landmarks; with velocities if one of them moves."""
+        moving = velocities if velocities.any() else None
+        return self._messages.point_cloud2(
+            stamp_ns, self._map_frame, ids, world_points, covariances, moving
+        )
+
+    def value(self, value: float) -> Any:
+        """Make a std_msgs/Float64."""
+        return self._messages.make('std_msgs/msg/Float64', data=float(value))
+
+
+class MarkerMessages:
+    """Makes MarkerArrays, of the classes that ``messages`` makes.
+
+    A stamp is in nanoseconds; ids (n,), points (n, 3) in metres and covariances (n, 3, 3) in m²,
+    None if unknown, are in the frame ``frame_id``.
+    """
+
+    def __init__(self, messages: OutgoingMessages, frame_id: str) -> None:
+        self._messages = messages
+        self._frame_id = frame_id
+
+    def landmarks(
+        self,
+        stamp_ns: int,
+        ids: IntArray,
+        points: FloatArray,
+        covariances: FloatArray | None,
+        update: Update | None,
+    ) -> Any:
+        """Return markers that replace all earlier ones.
+
+        They are points, ids, the last residuals, distances and directions, and, where covariances
+        are known, ellipsoids.
+        """
+        if not len(points):
+            return self.none(stamp_ns)
+        header = self._messages.header(stamp_ns, self._frame_id)
+        labels = [
+            self._label(header, number, landmark_id, point)
+            for number, (landmark_id, point) in enumerate(
+                zip(ids[:MAX_LABELS].tolist(), points, strict=False)
+            )
+        ]
+        lines = self._residual_lines(header, ids, points, update)
+        ellipsoids = self._ellipsoids(header, points, covariances)
+        halves = [] if update is None else self._halves(header, ids, points, update)
+        drawn = [self._points(header, points), lines, *halves, *ellipsoids, *labels]
+        return self._array([self._removal(header), *drawn])
+
+    def places(self, stamp_ns: int, poses: FloatArray) -> Any:
+        """Return arrows, in place of all earlier markers, at poses (q, 4, 4) of a lost robot."""
+        header = self._messages.header(stamp_ns, self._frame_id)
+        arrows = []
+        for number, pose in enumerate(poses[:MAX_LABELS]):
+            arrow = self._marker(header, 'possible places', ARROW, ORANGE, ARROW_WIDTH_M)
+            arrow.id = number
+            arrow.pose = self._messages.pose(pose)
+            arrow.scale.x = ARROW_LENGTH_M
+            arrows.append(arrow)
+        return self._array([self._removal(header), *arrows])
+
+    def none(self, stamp_ns: int) -> Any:
+        """Return what removes all earlier markers."""
+        return self._array([self._removal(self._messages.header(stamp_ns, self._frame_id))])
+
+    def _array(self, markers: list[Any]) -> Any:
+        return self._messages.make('visualization_msgs/msg/MarkerArray', markers=markers)
+
+    def _removal(self, header: Any) -> Any:
+        return self._marker(header, '', 0, WHITE, 0.0, action=DELETEALL)
+
+    def _points(self, header: Any, points: FloatArray) -> Any:
+        marker = self._marker(header, 'landmarks', SPHERE_LIST, GREEN, POINT_SIZE_M)
+        marker.points = [self._messages.point(point) for point in points]
+        return marker
+
+    def _ellipsoids(
+        self, header: Any, points: FloatArray, covariances: FloatArray | None
+    ) -> list[Any]:
+        """Return an ellipsoid for each of the first landmarks; none if no covariance is known."""
+        if covariances is None:
+            return []
+        variances, axes = np.linalg.eigh(covariances[:MAX_LABELS])
+        axes *= np.linalg.det(axes)[:, None, None]  # a rotation, not a reflection
+        sizes_m = 2.0 * ELLIPSOID_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+        markers = []
+        for number, (point, size, turn) in enumerate(zip(points, sizes_m, axes, strict=False)):
+            marker = self._marker(header, 'uncertainties', SPHERE, PALE_GREEN, MIN_SIZE_M)
+            marker.id = number
+            marker.pose.position = self._messages.point(point)
+            marker.pose.orientation = self._messages.quaternion(turn)
+            marker.scale = self._messages.vector(np.maximum(size, MIN_SIZE_M))
+            markers.append(marker)
+        return markers
+
+    def _residual_lines(
+        self, header: Any, ids: IntArray, points: FloatArray, update: Update | None
+    ) -> Any:
+        """Return a line from each landmark just seen to where it was seen."""
+        marker = self._marker(header, 'residuals', LINE_LIST, ORANGE, LINE_WIDTH_M)
+        if update is not None:
+            _, seen, rows = np.intersect1d(update.ids, ids, return_indices=True)
+            ends = points[rows]
+            lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
+            marker.points = [self._messages.point(point) for point in lines]
+        return marker
+
+    def _halves(self, header: Any, ids: IntArray, points: FloatArray, update: Update) -> list[Any]:
+        """Return circles of distances about their landmarks, and lines in directions, if any."""
+        rings, ends = half_sights(update, ids, points)
+        robot = update.pose[:3, 3]
+        around = np.column_stack([np.cos(RING), np.sin(RING)])
+        circles = [
+            np.column_stack([ring[:2] + ring[2] * around, np.full(len(RING), robot[2])])
+            for ring in rings[:MAX_RINGS]
+        ]
+        pairs = {
+            'ranges': [np.stack([circle[:-1], circle[1:]], axis=1) for circle in circles],
+            'bearings': [np.stack([np.tile(robot, (len(ends), 1)), ends], axis=1)],
+        }
+        markers = []
+        for namespace, lines in pairs.items():
+            marker = self._marker(header, namespace, LINE_LIST, SKY, LINE_WIDTH_M)
+            joined = np.concatenate([np.empty((0, 3)), *(each.reshape(-1, 3) for each in lines)])
+            marker.points = [self._messages.point(point) for point in joined]
+            if marker.points:
+                markers.append(marker)
+        return markers
+
+    def _label(self, header: Any, number: int, landmark_id: int, point: FloatArray) -> Any:
+        marker = self._marker(header, 'ids', TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)
+        marker.id = number
+        marker.text = str(landmark_id)
+        marker.pose.position = self._messages.point(point + [0.0, 0.0, TEXT_HEIGHT_M])
+        return marker
+
+    def _marker(
+        self,
+        header: Any,
+        namespace: str,
+        kind: int,
+        color: tuple[float, ...],
+        size_m: float,
+        action: int = ADD,
+    ) -> Any:
+        make, messages = self._messages.make, self._messages
+        red, green, blue, opacity = color
+        return make(
+            'visualization_msgs/msg/Marker',
+            header=header,
+            ns=namespace,
+            id=0,
+            type=kind,
+            action=action,
+            pose=messages.pose(np.eye(4)),
+            scale=messages.vector(np.full(3, size_m)),
+            color=make('std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=opacity),
+            lifetime=make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
+            frame_locked=False,
+            points=[],
+            colors=[],
+            texture_resource='',
+            texture=make(
+                'sensor_msgs/msg/CompressedImage',
+                header=messages.header(0, ''),
+                format='',
+                data=messages.octets(b''),
+            ),
+            uv_coordinates=[],
+            text='',
+            mesh_resource='',
+            mesh_file=make(
+                'visualization_msgs/msg/MeshFile', filename='', data=messages.octets(b'')
+            ),
+            mesh_use_embedded_materials=False,
+        )
+
+
+LITTLE_ENDIAN = bytes((0, 1, 0, 0))
+POSE_NUMBERS, TWIST_NUMBERS, COVARIANCE_NUMBERS = 7, 6, 36
+UNCERTAIN_NUMBERS = POSE_NUMBERS + COVARIANCE_NUMBERS
+
+_STAMP = struct.Struct('<iI')
+_LINEAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
+_UNKNOWN = np.array([-1.0] + [0.0] * 35)
+_COVARIANCE_ENTRIES = (6 * _LINEAR_FIRST[:, None] + _LINEAR_FIRST).ravel()
+
+
+class StateMessages:
+    """Makes messages of the base's pose in the map; as bytes, by the names of their frames."""
+
+    def __init__(self, map_frame: str, base_frame: str) -> None:
+        self._pose = _Layout((map_frame,), UNCERTAIN_NUMBERS)
+        self._odometry = _Layout(
+            (map_frame, base_frame), UNCERTAIN_NUMBERS + TWIST_NUMBERS + COVARIANCE_NUMBERS
+        )
+
+    def pose(self, stamp_ns: int, uncertain: FloatArray) -> bytes:
+        """Make a geometry_msgs/PoseWithCovarianceStamped of what ``uncertain_pose`` returns."""
+        return self._pose.message(stamp_ns, uncertain)
+
+    def odometry(
+        self,
+        stamp_ns: int,
+        uncertain: FloatArray,
+        body_velocity: FloatArray,
+        covariance: FloatArray | None,
+    ) -> bytes:
+        """Make a nav_msgs/Odometry of the same and a velocity; its covariance None if unknown."""
+        velocity = body_velocity[_LINEAR_FIRST]
+        return self._odometry.message(stamp_ns, uncertain, velocity, _covariance(covariance))
+
+
+def uncertain_pose(pose: FloatArray, covariance: FloatArray | None) -> FloatArray:
+    """Return the (43,) numbers of a geometry_msgs/PoseWithCovariance; covariance None if unknown.
+
+    It is along the map's axes, rad² and m².
+    """
+    return np.concatenate((*_position_and_quaternion(pose), _covariance(covariance)))
+
+
+def encode_transform(stamp_ns: int, parent: str, child: str, pose: FloatArray) -> bytes:
+    """Serialise a tf2_msgs/TFMessage of the pose of frame ``child`` in frame ``parent``."""
+    return _transform_layout(parent, child).message(stamp_ns, *_position_and_quaternion(pose))
+
+
+def _covariance(covariance: FloatArray | None) -> FloatArray:
+    """Return 36 numbers, position first; −1 first, as in Imu, if the covariance is unknown."""
+    if covariance is None:
+        return _UNKNOWN
+    numbers: FloatArray = covariance.ravel()[_COVARIANCE_ENTRIES]
+    return numbers
+
+
+def _position_and_quaternion(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return position (3,) and quaternion (4,) xyzw."""
+    return pose[:3, 3], so3.to_quaternion(pose[:3, :3])
+
+
+@lru_cache(maxsize=8)
+def _transform_layout(parent: str, child: str) -> _Layout:
+    return _Layout((parent, child), POSE_NUMBERS, of_sequence=True)
+
+
+class _Layout:
+    """A little-endian message of a stamp, strings that never change and then float64 alone."""
+
+    def __init__(self, strings: tuple[str, ...], numbers: int, of_sequence: bool = False) -> None:
+        count = struct.pack('<I', 1) if of_sequence else b''
+        self._stamp_at = ENCAPSULATION_BYTES + len(count)
+        head = LITTLE_ENDIAN + count + bytes(_STAMP.size)
+        head += b''.join(encode_string(string) for string in strings)
+        head += bytes((ENCAPSULATION_BYTES - len(head)) % 8)
+        self._bytes = bytearray(head + bytes(8 * numbers))
+        self._numbers = np.frombuffer(self._bytes, '<f8', offset=len(head))
+
+    def message(self, stamp_ns: int, *numbers: FloatArray) -> bytes:
+        """Return the message with this stamp and these numbers, one part after the other."""
+        _STAMP.pack_into(self._bytes, self._stamp_at, *divmod(stamp_ns, NANOSECONDS_PER_SECOND))
+        np.concatenate(numbers, out=self._numbers)
+        return bytes(self._bytes)

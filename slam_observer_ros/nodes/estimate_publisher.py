@@ -18,13 +18,13 @@ from slam_observer_ros.common.stamps import is_due, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.messages.clouds import FLOAT32_ID_LIMIT
-from slam_observer_ros.messages.estimate_messages import (
+from slam_observer_ros.messages.outgoing import (
+    encode_point_cloud,
     EstimateMessages,
     PATH_SPACING_NS,
     StateMessages,
     uncertain_pose,
 )
-from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.ros_node import (
     LATCHED_POSE_QOS,
     LATCHED_QOS,

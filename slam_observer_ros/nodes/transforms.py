@@ -18,7 +18,7 @@ from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.detections import CAMERA_INFO, decode_camera_info
-from slam_observer_ros.messages.estimate_messages import encode_transform
+from slam_observer_ros.messages.outgoing import encode_transform
 from slam_observer_ros.messages.poses import decode_transforms
 from slam_observer_ros.nodes.ros_node import (
     message_class,

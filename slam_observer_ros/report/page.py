@@ -22,7 +22,7 @@ from slam_observer_ros.common.errors import failing, json_text, OutputError, sig
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import used_points
-from slam_observer_ros.messages.estimate_messages import half_sights
+from slam_observer_ros.messages.outgoing import half_sights
 from slam_observer_ros.recordings.trajectory import interpolate
 from slam_observer_ros.report.summary import ACCURACY_ROWS, FIGURES
 from slam_observer_ros.runs.metrics import (

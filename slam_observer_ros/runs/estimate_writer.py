@@ -13,14 +13,14 @@ from slam_observer_ros.common.stamps import is_due, NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimate import Estimate
-from slam_observer_ros.messages.estimate_messages import (
+from slam_observer_ros.messages.outgoing import (
     encode_transform,
     EstimateMessages,
+    OutgoingMessages,
     PATH_SPACING_NS,
     StateMessages,
     uncertain_pose,
 )
-from slam_observer_ros.messages.outgoing import OutgoingMessages
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import SelectedTopics

@@ -17,13 +17,13 @@ from slam_observer_ros.estimates import Update
 from slam_observer_ros.events import BEARING, IMPOSSIBLE_ID, MAX_ID, POINT, RANGE
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.messages import clouds, poses
-from slam_observer_ros.messages.estimate_messages import (
+from slam_observer_ros.messages.outgoing import (
+    encode_point_cloud,
     encode_transform,
     MarkerMessages,
     StateMessages,
     uncertain_pose,
 )
-from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.messages.registry import decoders
 
 FINITE = st.floats(-1e6, 1e6)

@@ -20,7 +20,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import decode_point_cloud2
-from slam_observer_ros.messages.estimate_messages import (
+from slam_observer_ros.messages.outgoing import (
     EstimateMessages,
     StateMessages,
     uncertain_pose,

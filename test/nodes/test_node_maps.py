@@ -27,7 +27,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import diagonal_blocks
 from slam_observer_ros.mapping.map_file import read_map
-from slam_observer_ros.messages.estimate_messages import StateMessages, uncertain_pose
+from slam_observer_ros.messages.outgoing import StateMessages, uncertain_pose
 from slam_observer_ros.messages.poses import pose_matrices
 from slam_observer_ros.nodes.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.nodes.observer_nodes import ObserverNode
