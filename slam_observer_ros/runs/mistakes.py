@@ -168,14 +168,13 @@ MOST_S = 300.0
 def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
     """Return the events until the robot has driven for DRIVE_S, with points that have ids.
 
-    Or until a ``part`` of that. A robot that reports no turn at all is not waited for to turn.
+    Or until a ``part`` of that.
     """
     kept: list[Event] = []
     drive, first_ns = Drive(), None
     for event in events:
         first_ns = event.stamp_ns if first_ns is None else first_ns
-        has_turned = drive.turned_rad > part * TURNED_RAD or not drive.turned_rad
-        is_enough = drive.driven_s > part * DRIVE_S and has_turned
+        is_enough = drive.driven_s > part * DRIVE_S and drive.turned_rad > part * TURNED_RAD
         if is_enough or event.stamp_ns - first_ns > part * to_ns(MOST_S):
             break
         drive.add(event)
