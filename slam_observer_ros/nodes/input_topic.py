@@ -296,7 +296,7 @@ class InputTopic:
         # Whether the node was held up, or /clock has stood still, since the last look
         if now_s - self._looked_s > HELD_UP_S and (self.last_received_s or 0.0) <= self._looked_s:
             self._held_s, self._resumed_s = now_s - self._looked_s, now_s
-        self._looked_s = now_s
+        looked_s, self._looked_s = self._looked_s, now_s
         clock_ns = self._node.get_clock().now().nanoseconds
         if clock_ns != self._clock_ns:
             self._clock_ns, self._clock_since_s = clock_ns, now_s
@@ -307,7 +307,7 @@ class InputTopic:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         types = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in types]
-        missing = self._listen_for_one_of(usable, now_s)
+        missing = self._listen_for_one_of(usable, looked_s)
         self._fault = missing or self._find_fault(publishers, usable)
         # Where they publish several types, the finding of that names the cause.
         is_shared = self.is_shared or self._several_types is not None
@@ -332,15 +332,18 @@ class InputTopic:
         """Note that topics were not to be looked at up to now."""
         self._looked_s = time.monotonic()
 
-    def _listen_for_one_of(self, usable: list[str], now_s: float) -> str:
-        """Listen for a type that comes; return why no message can be heard, or ''."""
+    def _listen_for_one_of(self, usable: list[str], looked_s: float) -> str:
+        """Listen for a type that comes; return why no message can be heard, or ''.
+
+        ``looked_s`` is the time of the last look, up to which all that came has been read: a busy
+        node may look late, when messages wait.
+        """
         if len(usable) > 1:
             usable = [name for name in usable if is_installed(name)] or usable
         self._several_types = None
         if not usable:
             return ''
-        last_s = max(self.last_received_s or 0.0, self._resumed_s)
-        chosen = self._types.best_of(usable, last_s, now_s)
+        chosen = self._types.best_of(usable, self.last_received_s or 0.0, looked_s)
         if len(usable) > 1:
             others = ', '.join(name for name in usable if name != chosen)
             self._several_types = of_types(self.topic, chosen, others)

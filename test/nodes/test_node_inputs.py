@@ -215,6 +215,25 @@ def test_of_two_types_on_a_topic_the_one_that_comes_is_heard(monkeypatch):
     assert source.doubt is None
 
 
+def test_a_node_that_is_always_busy_leaves_a_silent_type_too_but_reads_what_waits_first(monkeypatch):
+    node, now_s = Mock(), [1000.0]
+    monkeypatch.setattr(time, 'monotonic', lambda: now_s[0])
+    node.get_clock.return_value = FakeClock()
+    node.resolve_topic_name.return_value = '/cmd_vel'
+    node.get_publishers_info_by_topic.return_value = [
+        Mock(topic_type=f'geometry_msgs/msg/{name}', qos_profile=QOS, node_namespace='/')
+        for name in ('Twist', 'TwistStamped')
+    ]
+    decoders = dict.fromkeys(('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'), Mock())
+    source = InputTopic(node, 'twist', decoders, Mock(), QOS)
+    heard = []
+    for wait_s in (0.25, 9.0, 1.5, 1.5, 9.0, 0.25):  # a message may wait where a look is late
+        now_s[0] += wait_s
+        source.check_publishers()
+        heard.append(node.create_subscription.call_args.args[0].__name__)
+    assert heard == ['Twist', 'Twist', 'Twist', 'TwistStamped', 'TwistStamped', 'TwistStamped']
+
+
 def test_a_node_that_was_not_to_look_was_not_busy(monkeypatch):
     node, now_s = Mock(), [1000.0]
     monkeypatch.setattr(time, 'monotonic', lambda: now_s[0])
