@@ -347,11 +347,7 @@ def _named(
     best = yield from _best(settings, events, before, singles, known)
     if best is before:
         # As with points in millimetres and in a camera's axes, where no single one helps.
-        best = (
-            before
-            if before.explains
-            else (yield from _best(settings, events, before, PAIRS, known))
-        )
+        best = yield from _best(settings, events, before, PAIRS, known)
     silent = []
     if is_silent and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
         silent = [found('no_turning')]
@@ -443,14 +439,12 @@ def _findings(corrections: Iterable[Correction], known: Maps | None) -> list[Fin
 class _Score:
     """How likely points are, by what a filter expected of them that believes a correction.
 
-    ``per_unit`` is added to ln densities, of which ``log_outlier`` is the one of a point anywhere
-    in view: they are per unit of what was recorded.
+    ``per_unit`` is added to ln densities: they are per unit of what was recorded.
     """
 
     correction: Correction
     likelihood: Likelihood
     per_unit: float
-    log_outlier: float
     turned_rad: float  # at most since the start, as it is seen
     scale: float  # of the wheels
     range_scale: float
@@ -497,11 +491,6 @@ class _Score:
         part = self.likelihood.select(self.likelihood.stamps_ns <= stamp_ns)
         return replace(self, likelihood=part)
 
-    @property
-    def explains(self) -> bool:
-        """Whether points are likelier than where they may be anywhere in view."""
-        return self.likelihood.mean > self.log_outlier + 1.0
-
 
 def _score(
     settings: Settings,
@@ -533,7 +522,6 @@ def _score(
             correction,
             recorder.likelihood,
             k * math.log(scale),
-            recorder.log_outlier,
             float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
             found_out.get('linear_scale_x', 1.0),
             found_out.get('range_scale', 1.0),

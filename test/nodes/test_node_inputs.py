@@ -215,7 +215,9 @@ def test_of_two_types_on_a_topic_the_one_that_comes_is_heard(monkeypatch):
     assert source.doubt is None
 
 
-def test_a_node_that_is_always_busy_leaves_a_silent_type_too_but_reads_what_waits_first(monkeypatch):
+def test_a_node_that_is_always_busy_leaves_a_silent_type_too_but_reads_what_waits_first(
+    monkeypatch,
+):
     node, now_s = Mock(), [1000.0]
     monkeypatch.setattr(time, 'monotonic', lambda: now_s[0])
     node.get_clock.return_value = FakeClock()
