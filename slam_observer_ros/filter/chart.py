@@ -168,7 +168,7 @@ class Chart:
         return sheared(P, self.first, self.all_still(points))
 
     def exp(self, x: FloatArray) -> SlamElement:
-        """Return how x moves pose and points: ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
+        """Return the motion by x: turns ŷ_i by ε_Ω, and shifts it by J(ε_Ω) ξ_i."""
         axes, k, p = self.axes, self.axes.point, self.axes.p
         xi = x[self.first :].reshape(-1, self.stride)[:, :k]
         return slam_exp(axes.full_pose(x[:p]), axes.full_points(xi))
