@@ -53,7 +53,9 @@ class Odometry:
         held = self._velocities.held(start_ns, stamp_ns)
         path = se3.path(np.eye(4), held.body_velocities * held.dt_s[:, None])
         Ad = se3.adjoint(se3.inverse(path[-1]) @ path)
-        covariance = se3.summed_noise(Ad, self._noise.covariances(held))
+        # ∫ Ad Q Adᵀ by the trapezoidal rule
+        shares = se3.at_poses(self._noise.covariances(held))
+        covariance: FloatArray = (Ad @ shares @ Ad.swapaxes(1, 2)).sum(axis=0)
         self._velocities.forget_before(stamp_ns)
         self._stamp_ns = stamp_ns
         return path[-1], covariance

@@ -225,7 +225,7 @@ class Estimate:
     def body_velocity_covariance(self) -> FloatArray | None:
         """(6, 6) covariance of :attr:`body_velocity`, as stated with it or as the settings say.
 
-        That of no velocity is what the robot may do then. None before there are two messages.
+        Without a velocity it is what the robot may do then. None before there are two messages.
         """
         held = self._timeline.velocity_in_force
         if held is None:

@@ -107,18 +107,16 @@ class Chart:
         """Return [[y_i]×, 0] (m, k, p): ξ_i of landmarks y_i whose ã_i is zero."""
         return -self.axes.turn_matrix(points)
 
-    def all_still(self, points: FloatArray, u: FloatArray | None = None) -> FloatArray:
-        """Return T (n stride, p) of x_i = T ε for n landmarks, with velocities ``u`` (n, 3).
+    def all_still(self, points: FloatArray) -> FloatArray:
+        """Return T (n stride, p) of x_i = T ε for n landmarks, but for their velocities.
 
-        A motion of the robot alone does that: it changes neither ã_i, nor a tag, nor ``u``.
+        A motion of the robot alone does that: it changes neither ã_i nor a tag.
         """
         still = self.still(points)
         if self.stride == self.axes.point:
             return still.reshape(-1, self.axes.p)
         T = np.zeros((len(points), self.stride, self.axes.p))
         T[:, : self.axes.point] = still
-        if self.velocity and u is not None:
-            T[:, self.axes.point + self.turn :] = self.still(u)
         return T.reshape(-1, self.axes.p)
 
     # The frame

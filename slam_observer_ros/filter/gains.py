@@ -181,7 +181,7 @@ class Gains(ABC):
 
     @property
     def _robot(self) -> int:
-        """P + c."""
+        """How many errors the robot and the calibration have: p + c."""
         return self.axes.p + self.calibration.count
 
     def advance(self, velocities: Velocities, interval: Interval) -> Advanced:
@@ -236,9 +236,20 @@ class Gains(ABC):
 
     def _alone(self, A: FloatArray) -> FilterState:
         """Return a robot at ``A`` without landmarks and without errors as plain arrays."""
-        none, size = np.empty((0, 3)), self._robot
-        return self.flat()._replace(
-            A=A, y_ref=none, a=none, P=np.zeros((size, size)), size=size, first=size, u=None
+        none, size, calibration = np.empty((0, 3)), self._robot, self.calibration
+        return FilterState(
+            A=A,
+            y_ref=none,
+            a=none,
+            P=np.zeros((size, size)),
+            size=size,
+            first=size,
+            stride=0,
+            is_planar=self._settings.two_d_mode,
+            rates=calibration.rates,
+            estimated=calibration.velocity_places,
+            drift=calibration.drift_covariance,
+            u=None,
         )
 
     def _room_for_motion(self) -> Advanced:

@@ -66,11 +66,6 @@ class JointCovariance:
         return other
 
     @property
-    def is_at_rest(self) -> bool:
-        """Whether landmarks are estimated, but no velocities of theirs."""
-        return not self.chart.velocity
-
-    @property
     def pose(self) -> FloatArray:
         """(p, p) covariance of ε."""
         return self.P[: self._p, : self._p]

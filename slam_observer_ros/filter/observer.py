@@ -1,4 +1,4 @@
-"""The SLAM_n(3) observer: state X̂, propagation (27), errors (29), and how an innovation acts.
+"""The SLAM_n(3) observer: state X̂, errors (29), and how an innovation acts.
 
 X̂ = (Â, â_1 … â_n) lives on the group; with the reference ξ° = [P°, p_i°] it gives the estimate
 P̂ = P° Â and p̂_i = p_i° + R_P° â_i (23). Everything here is in the frame of P°, where the
@@ -17,7 +17,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.filter.arrays import FilterArrays
-from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import EstimatedAxes
 
 
@@ -66,12 +66,6 @@ class Observer(FilterArrays):
         """Return the errors e_i (29) and residuals r_i (m, 3) of landmarks seen at ``points``."""
         e = se3.transform(self.A, points) - self.a[rows]  # (29)  ρ(X̂⁻¹, y)_i
         return e, e - self.y_ref[rows]  # the paper prints e_i − p_i°, which it is for P° = I
-
-    def propagate(self, path: FloatArray) -> None:
-        """Advance Â to the end of a ``path`` (k + 1, 4, 4), along which it is Â exp(V dt) (27)."""
-        A = self.A
-        A[...] = path[-1]
-        A[:3, :3] = so3.normalise(A[:3, :3])
 
     def correct(self, D: FloatArray, rows: IntArray | slice, d: FloatArray) -> None:
         """Move the state from the left: X̂ ← (D, d_i) · X̂, d_i (m, 3) for landmarks ``rows``.

@@ -8,6 +8,7 @@ x = (ε, c̃, ξ_1 … ξ_n), ξ_i = ã_i + [ŷ_i]× ε_Ω, and more of landmark
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -41,11 +42,9 @@ from slam_observer_ros.models.calibration import calibrated, with_moves
 from slam_observer_ros.models.held_velocities import held, Velocities
 from slam_observer_ros.models.motion_noise import (
     Factors,
-    gap_variances,
     learn,
-    motion_variances,
+    motion_noise,
     MotionFigures,
-    stated_motion_covariances,
 )
 from slam_observer_ros.models.point_noise import (
     point_covariances,
@@ -89,15 +88,7 @@ def advance(
     Ad = se3.adjoint(path)[:, axes.pose]
     # White noise: held longer than usual, one error has moved the robot by so much more.
     usual_s = pieces.usual_s + max(to_s(-interval.delay_ns), 0.0)
-    Q = motion_variances(V, dt_s, pieces.before_s, usual_s, figures)
-    stated = None
-    if np.count_nonzero(pieces.is_stated):
-        Q[np.repeat(pieces.is_stated, 3, axis=1)] = 0.0
-        stated = stated_motion_covariances(
-            pieces.covariances, dt_s, pieces.before_s, figures.factors
-        )
-    if np.count_nonzero(pieces.gap_s):
-        Q += gap_variances(pieces.gap_s, figures)
+    Q, stated = motion_noise(replace(pieces, body_velocities=V, usual_s=usual_s), figures)
     out.variances[:] = Q.sum(axis=0)
     _summed_noise(Ad, se3.at_poses(Q), out)
     if stated is not None:

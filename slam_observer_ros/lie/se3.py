@@ -186,19 +186,6 @@ def at_poses(pieces: FloatArray) -> FloatArray:
     return shares
 
 
-def summed_noise(Ad: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return ∫ Ad_A Q Ad_Aᵀ along a path (p, p), by the trapezoidal rule.
-
-    From rows of Ad_A (k + 1, p, 6) at its poses, and Q (k, 6, 6) of its motions, body frame.
-    """
-    p = Ad.shape[1]
-    noises = Ad @ at_poses(covariances)
-    # The sum of all products with Ad_Aᵀ is one product.
-    flat = noises.swapaxes(0, 1).reshape(p, -1)
-    noise: FloatArray = flat.dot(Ad.swapaxes(0, 1).reshape(p, -1).T)
-    return noise
-
-
 def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -> FloatArray:
     """Return poses at a ``share`` (…), 0 to 1, of the way between two, as tf2 has them.
 

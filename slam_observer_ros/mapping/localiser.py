@@ -243,7 +243,7 @@ class Localiser:
 
     @property
     def likely_places(self) -> list[Place]:
-        """Those of them that are worth to be named."""
+        """The places that are worth to be named, the most likely first."""
         finder = self._finder
         return [] if finder is None or finder.places is None else finder.places.likely
 

@@ -119,21 +119,9 @@ class MotionNoise:
 
     def covariances(self, held: HeldVelocities) -> FloatArray:
         """Return what k motions may be off by: (k, 6, 6), rad² and m²."""
-        some_are_stated = np.count_nonzero(held.is_stated)
-        variances = motion_variances(
-            held.body_velocities, held.dt_s, held.before_s, held.usual_s, self.figures
-        )
-        if some_are_stated:
-            variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
-        # In a gap the robot may do anything that is allowed.
-        if np.count_nonzero(held.gap_s):
-            variances += gap_variances(held.gap_s, self.figures)
+        variances, stated = motion_noise(held, self.figures)
         covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
-        if some_are_stated:  # of angular and linear part one may have none
-            covariances += stated_motion_covariances(
-                held.covariances, held.dt_s, held.before_s, self.factors.applied
-            )
-        return covariances
+        return covariances if stated is None else covariances + stated
 
     @property
     def figures(self) -> MotionFigures:
@@ -159,34 +147,31 @@ def _some_last_longer(until_s: FloatArray, usual_s: FloatArray) -> bool:
     return bool(np.count_nonzero(until_s > usual_s))
 
 
-def motion_variances(
-    V: FloatArray,
-    dt_s: FloatArray,
-    before_s: FloatArray,
-    usual_s: FloatArray,
-    figures: MotionFigures,
-) -> FloatArray:
-    """Return the variances (k, 6) of what velocities (k, 6) without a stated covariance move by.
+def motion_noise(
+    held: HeldVelocities, figures: MotionFigures
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return the variances (k, 6) of motions, and the covariances (k, 6, 6) stated besides.
 
-    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), and for ``usual_s`` (2,) as a rule,
-    seconds.
+    In rad² and m². The variances are zero in a part, angular or linear, whose covariance is
+    stated. None is returned for the covariances where no message states one.
     """
+    V, dt_s, stated = held.body_velocities, held.dt_s[:, None], None
     # White noise of the stated density, and in proportion to the mean speed: a single message is
     # noisy itself, and its square too large.
-    variances = figures.densities * _white_s(before_s, dt_s[:, None], usual_s)
+    variances: FloatArray = figures.densities * _white_s(held.before_s, dt_s, held.usual_s)
     if np.count_nonzero(figures.scales):
-        variances += (figures.scales * averaged(V, dt_s, SPEED_WINDOW_S)) ** 2 * dt_s[:, None]
-    grown: FloatArray = variances * figures.factors.repeat(3)
-    return grown
+        variances += (figures.scales * averaged(V, held.dt_s, SPEED_WINDOW_S)) ** 2 * dt_s
+    variances = variances * figures.factors.repeat(3)
+    if np.count_nonzero(held.is_stated):
+        variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
+        stated = _stated(held.covariances, held.dt_s, held.before_s, figures.factors)
+    # In a gap the robot may do anything that is allowed.
+    if np.count_nonzero(held.gap_s):
+        variances += np.minimum(figures.unknown * held.gap_s[:, None], MAX_GAP_ERRORS**2)
+    return variances, stated
 
 
-def gap_variances(gap_s: FloatArray, figures: MotionFigures) -> FloatArray:
-    """Return the variances (k, 6) of motions in time without a velocity: any that is allowed."""
-    variances: FloatArray = np.minimum(figures.unknown * gap_s[:, None], MAX_GAP_ERRORS**2)
-    return variances
-
-
-def stated_motion_covariances(
+def _stated(
     covariances: FloatArray, dt_s: FloatArray, before_s: FloatArray, factors: FloatArray
 ) -> FloatArray:
     """Return covariances (k, 6, 6) of motions by velocities with stated covariances (k, 6, 6).

@@ -127,7 +127,8 @@ LEAST_NOISE = 1e-6
 def orientation_covariances(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatArray:
     """Return the covariances (m, 3, 3) of tags' orientations, rad², of tags turned by ``Z``.
 
-    That of least squares, (Jᵀ J)⁻¹ σ² of the corners' derivatives by the pose, without position.
+    As least squares has them: (Jᵀ J)⁻¹ σ² of the corners' derivatives by the pose, without
+    position.
     Of tags whose ``Z`` is zero nothing is known.
     """
     covariances = np.tile(np.pi**2 * np.eye(3), (len(Z), 1, 1))

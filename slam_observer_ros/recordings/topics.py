@@ -233,8 +233,8 @@ class _Choice:
 def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> TransformTopics:
     """Pick the /tf and the /tf_static of the robot whose measurements are replayed.
 
-    Robots in namespaces may each have their own, with the same names of frames. Those of the
-    namespace that the inputs share come first, then those further out, /tf at last. Where none
+    Robots in namespaces may each have their own, with the same names of frames. First comes
+    the namespace that the inputs share, then each one further out, /tf at last. Where none
     of these is recorded, another namespace's are taken if there is only one.
     """
     trees = [

@@ -376,7 +376,7 @@ class Standing:
         self.slip: int | None = None  # which of the SLIPS goes on
         self._starts: list[Look] = []  # looks to compare with, …
         self._latest: list[Look] = []  # … those to be compared, …
-        self._tested: list[Look] = []  # … and those of the last comparison
+        self._tested: list[Look] = []  # … and the ones last compared
         # By odometry alone: the pose, the one before the last motion, and that at the last start.
         self.pose, self.before, self._earlier = np.eye(4), np.eye(4), np.eye(4)
         self.sensor_frame, self.due_ns = '', 0  # an observation is due from another one, or then

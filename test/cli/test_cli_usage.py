@@ -162,6 +162,18 @@ def test_stopped_in_the_middle(tmp_path, stop):
     assert not list(tmp_path.iterdir())
 
 
+def run_program(text):
+    """Run the text of a program in the checkout, with its own interpreter."""
+    return subprocess.run(
+        [sys.executable, '-c', text],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
 STOPPED_WHILE_A_CLASS_IS_DEFINED = """
 import signal, sys
 from slam_observer_ros.cli import doctor, main
@@ -181,13 +193,7 @@ sys.exit(main.main(['doctor']))
 
 @pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
 def test_stopped_while_a_class_is_defined(stop):
-    ended = subprocess.run(
-        [sys.executable, '-c', STOPPED_WHILE_A_CLASS_IS_DEFINED.format(first=stop.name)],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    ended = run_program(STOPPED_WHILE_A_CLASS_IS_DEFINED.format(first=stop.name))
     assert (ended.returncode, ended.stderr) == (128 + stop, '')
 
 
@@ -211,14 +217,7 @@ sys.exit(main.main(['doctor']))
 
 @pytest.mark.parametrize('first', [signal.SIGINT, signal.SIGTERM])
 def test_a_second_ctrl_c_disturbs_no_clearing_away(first):
-    ended = subprocess.run(
-        [sys.executable, '-c', STOPPED_TWICE.format(first=first.name)],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    ended = run_program(STOPPED_TWICE.format(first=first.name))
     assert (ended.returncode, ended.stdout, ended.stderr) == (128 + first, 'cleared away\n', '')
 
 

@@ -29,7 +29,7 @@ class ExactMapCovariance(JointCovariance):
     """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
 
     active = slice(0)
-    is_dense = is_at_rest = False
+    is_dense = False
 
     def __init__(self, joint: JointCovariance, covariances: FloatArray) -> None:
         chart = joint.chart.with_postponed(0)
