@@ -514,7 +514,7 @@ def looked_for(part: CalibrationEstimate) -> str:
 def depth_text(found: Found) -> str:
     """Return in words whether ranges are depths, and by what."""
     if found.depth_gain is None:
-        return 'range: what is seen is all around'
+        return 'range: what is seen is all around, or no whole points'
     what = 'depth along the axis' if found.range_is_depth else 'range'
     gain, deviation = found.depth_gain
     kept = '' if found.range_is_depth == (gain > 0.0) else ', which is not sure, or was not asked'

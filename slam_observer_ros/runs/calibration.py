@@ -419,9 +419,10 @@ class CalibrationFinder:
         behind = [
             cosines(event.lines_of_sight, event.sensor_axis) <= LEAST_COSINE
             for event in self._material.events
-            if isinstance(event, ObservationEvent) and len(event.ids)
+            if isinstance(event, ObservationEvent) and len(event.ids) and event.kinds is None
         ]
-        if np.mean(np.concatenate(behind)) > MAX_BEHIND:  # else all is before the sensor
+        # Else all is before the sensor; half points have no direction, or no range.
+        if not behind or np.mean(np.concatenate(behind)) > MAX_BEHIND:
             return replace(settings, range_is_depth=False), None
         (_, of_range), (_, of_depth) = (
             self._run(replace(settings, range_is_depth=is_depth)) for is_depth in (False, True)
@@ -571,8 +572,11 @@ EVALUATIONS = 12
 TOLERANCE = 0.03
 """How near the factors come to the most likely ones, as a share."""
 
-NO_EFFECT = 1e-6
-"""Change of the log likelihood below which a factor has none."""
+NO_EFFECT = 0.1
+"""Change of the log likelihood, by twice and by half the noise, below which a factor has none.
+
+The factor would be known to 20 times itself at best.
+"""
 
 DIGITS = 3
 """Significant digits of a noise figure; it is seldom known to so many."""
@@ -610,9 +614,9 @@ class NoiseFactor:
 
 def without_effect(objective: Objective, n: int) -> list[int]:
     """Return which of n factors change nothing."""
-    nominal = objective(np.zeros(n))
-    steps = FIRST_STEP * np.eye(n)
-    return [i for i in range(n) if abs(objective(steps[i]) - nominal) < NO_EFFECT]
+    nominal, steps = objective(np.zeros(n)), FIRST_STEP * np.eye(n)
+    changes = [[objective(sign * step) - nominal for sign in (1.0, -1.0)] for step in steps]
+    return [i for i, change in enumerate(changes) if np.max(np.abs(change)) < NO_EFFECT]
 
 
 def most_likely(objective: Objective, n: int) -> LikelyFactors:

@@ -172,6 +172,11 @@ def test_the_search_finds_the_maximum_and_how_sharp_it_is():
     assert found.deviations == pytest.approx(expected, rel=0.01)
 
 
+def test_a_factor_that_hardly_changes_what_is_likely_is_left_as_stated():
+    hardly = remembered(lambda x: -1e-3 * (x[0] + x[1]) ** 2 - (x[1] - 0.35) ** 2)
+    assert without_effect(hardly, 2) == [0]  # by twice the noise the second changes little, too
+
+
 def test_what_has_no_maximum_is_not_determined():
     found = most_likely(remembered(lambda x: -((x[0] - 0.1) ** 2) + 1e-3 * x[1]), 2)
     assert math.isfinite(found.deviations[0])
