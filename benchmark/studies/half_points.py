@@ -4,11 +4,16 @@
 ``uwb.yaml``, and how many of 100 starts are found on Plaza and in random halls. By how much the
 ranges, which are 7 % long, are so is not known. The data is not shipped: it is read from ``plaza``
 in the folder that SLAM_OBSERVER_DATA names.
+
+``--random 30`` drives through random halls whose landmarks are not known, by each kind, from the
+seed ``--first`` on; ``--straight 50`` straight on past eight landmarks in each of so many.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 import logging
 import math
 import os
@@ -56,6 +61,19 @@ Found: TypeAlias = tuple[float, float, bool]
 def main() -> None:
     """Print a row for each run, in the surveyed map and without one."""
     logging.getLogger('slam_observer_ros').setLevel(logging.CRITICAL)
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, help_ in (
+        ('random', 'how many halls of each kind'),
+        ('straight', 'how many straight drives of each kind'),
+        ('first', 'the first seed'),
+    ):
+        parser.add_argument(f'--{name}', type=int, default=0, help=help_)
+    given = parser.parse_args()
+    if given.random or given.straight:
+        for kind in (RANGE, BEARING):
+            write_halls(kind, range(given.first, given.first + given.random))
+            write_straight(kind, range(given.first, given.first + given.straight))
+        return
     for run in (1, 2):
         for is_surveyed in (True, False):
             sys.stdout.write(f'{row(run, is_surveyed)}\n')
@@ -151,6 +169,160 @@ def lost_in_hall(seed: int, kind: int, in_a_line: bool, walls: float) -> Found:
             events.append(ObservationEvent(stamp_ns, rows, shown, kinds=np.full(3, kind)))
         A = A @ se3.exp(STEP_S * V)
     return lost(events, Trajectory.from_samples(stamps_ns, poses), anchors, HALL)
+
+
+@dataclass(frozen=True)
+class Hall:
+    """A random hall and a drive in it, with a sensor and odometry as noisy as its settings say."""
+
+    settings: Settings
+    points: FloatArray  # (n, 3)
+    events: list[Event]
+    truth: Trajectory
+
+    @classmethod
+    def random(
+        cls, seed: int, kind: int, duration_s: float = 200.0, straight: bool = False
+    ) -> Hall:
+        """Drive from one random place to the next; or ``straight`` on through the middle."""
+        rng = np.random.default_rng([seed, kind])
+        size, n = rng.uniform(8.0, 40.0, 2), int(rng.integers(5, 16))
+        points = np.column_stack([rng.uniform(0.0, size, (n, 2)), np.zeros(n)])
+        gyro, slip = rng.uniform(0.005, 0.03), rng.uniform(0.01, 0.05)
+        smallest, largest = (0.05, 0.7) if kind == RANGE else (0.005, 0.05)
+        sigma = float(np.exp(rng.uniform(math.log(smallest), math.log(largest))))
+        half_view = np.pi if kind == RANGE else rng.uniform(0.5, np.pi)
+        reach_m = rng.uniform(0.4, 1.2) * float(np.linalg.norm(size))
+        scale, track, wheel = 1.0 + np.array([0.05, 0.02, 0.02]) * rng.normal(size=3)
+        bias = 0.003 * rng.normal() if kind == BEARING else 0.0
+        settings = replace(
+            shipped_settings('uwb' if kind == RANGE else 'bearings'),
+            angular_velocity_noise=(0.0, 0.0, gyro),
+            linear_velocity_noise=(slip, slip, 0.0),
+            linear_scale_stddev=(0.03, 0.0, 0.0),
+            angular_scale_stddev=(0.0, 0.0, 0.03),
+            range_noise=sigma if kind == RANGE else 0.5,
+            bearing_noise=sigma if kind == BEARING else 0.01,
+        )
+        speed = rng.uniform(0.3, 1.0)
+        if straight:
+            points, n = rng.uniform([-2.0, -8.0, 0.0], [25.0 * speed + 2.0, 8.0, 0.0], (8, 3)), 8
+            reach_m = np.inf
+        heading = rng.uniform(-np.pi, np.pi)
+        A = np.eye(4) if straight else pose_of(size[0] / 2.0, size[1] / 2.0, heading)
+        goal, turn = size / 2.0, 0.0
+        events: list[Event] = []
+        stamps_ns, poses = [], []
+        for step in range(round(duration_s / STEP_S)):
+            stamp_ns = round(1e9 * STEP_S) * step
+            ahead = se3.transform(se3.inverse(A), np.array([[*goal, 0.0]]))[0]
+            if np.linalg.norm(ahead) < 1.0:
+                goal = rng.uniform(0.1, 0.9, 2) * size
+            if not straight:
+                turn += 0.3 * (np.clip(np.arctan2(ahead[1], ahead[0]), -0.6, 0.6) - turn)
+            V = np.array([0.0, 0.0, turn, speed, 0.0, 0.0])
+            noise = np.array([0.0, 0.0, gyro, slip, slip, 0.0]) / np.sqrt(STEP_S)
+            measured = V * [1, 1, track, wheel, 1, 1] + [0, 0, bias, 0, 0, 0]
+            stamps_ns.append(stamp_ns)
+            poses.append(A)
+            events.append(VelocityEvent(stamp_ns, measured + noise * rng.normal(size=6)))
+            if step % 4 == 0:
+                lines = se3.transform(se3.inverse(A), points)
+                ranges_m = np.linalg.norm(lines, axis=1)
+                angles = np.arctan2(lines[:, 1], lines[:, 0])
+                seen = (ranges_m < reach_m) & (np.abs(angles) < half_view)
+                rows = rng.permutation(np.flatnonzero(seen))[:3]
+                off = sigma * rng.normal(size=len(rows))
+                shown = np.zeros((len(rows), 3))
+                if kind == RANGE:
+                    shown[:, 0] = ranges_m[rows] * scale + off
+                else:
+                    seen_at = angles[rows] + off
+                    shown[:, 0], shown[:, 1] = np.cos(seen_at), np.sin(seen_at)
+                if len(rows):
+                    kinds = np.full(len(rows), kind)
+                    events.append(ObservationEvent(stamp_ns, rows, shown, kinds=kinds))
+            A = A @ se3.exp(STEP_S * V)
+        return cls(settings, points, events, Trajectory.from_samples(stamps_ns, poses))
+
+    def drive(self, is_surveyed: bool) -> tuple[Estimator, Trajectory, float]:
+        """Return the estimator, what it has estimated online, and the ANEES of the position."""
+        poses: list[tuple[int, FloatArray]] = []
+        nees: list[float] = []
+
+        def note(update: Update) -> None:
+            poses.append((update.stamp_ns, update.pose))
+            at = np.searchsorted(self.truth.stamps_ns, update.stamp_ns)
+            off = (update.pose[:3, 3] - self.truth.poses[at, :3, 3])[:2]
+            P = np.asarray(estimator.pose_covariance)[3:5, 3:5]
+            if P[0, 0] > 0.0:
+                nees.append(float(off @ np.linalg.solve(P, off)) / 2.0)
+
+        start = self.truth.poses[0]
+        mode = 'uncertain' if is_surveyed else 'off'
+        settings = replace(self.settings, localization_mode=mode)
+        estimator = Estimator(settings, initial_pose=start, on_update=note)
+        if is_surveyed:
+            n = len(self.points)
+            covariances, counts = np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.zeros(n, np.int64)
+            known = LandmarkMap(np.arange(n), self.points, covariances, counts)
+            estimator.load_map(known, start, np.zeros((6, 6)))
+        for event in self.events:
+            estimator.add(event)
+        estimator.flush()
+        return estimator, Trajectory.from_samples(*zip(*poses, strict=True)), float(np.mean(nees))
+
+
+def write_halls(kind: int, seeds: Sequence[int]) -> None:
+    """Write by how much errors are larger than in a surveyed map, and what has entered."""
+    ratios, smoothed, anees, entered, wrong, count = [], [], [], 0, 0, 0
+    for seed in seeds:
+        hall = Hall.random(seed, kind)
+        known, of_known, _ = hall.drive(is_surveyed=True)
+        found, of_found, consistency = hall.drive(is_surveyed=False)
+        seen = {id_ for e in hall.events if isinstance(e, ObservationEvent) for id_ in e.ids}
+        errors = [
+            trajectory_errors(each, hall.truth).ate_rmse_m
+            for each in (of_found, of_known, *(smooth(each) for each in (found, known)))
+        ]
+        off_m = np.linalg.norm(found.world_points - hall.points[found.landmark_ids], axis=1)
+        sigmas_m = np.sqrt(np.trace(np.asarray(found.landmark_covariances), axis1=1, axis2=2))
+        far = int(((off_m > 4.0 * sigmas_m) & (off_m > 0.5)).sum())
+        ratios.append(errors[0] / errors[1])
+        smoothed.append(errors[2] / errors[3])
+        anees.append(consistency)
+        entered, count, wrong = entered + len(off_m), count + len(seen), wrong + far
+        sys.stdout.write(
+            f'{seed:3} {errors[0]:.3f} {errors[1]:.3f} smoothed {errors[2]:.3f} {errors[3]:.3f}, '
+            f'{len(off_m)} of {len(seen)} entered, {far} off, ANEES {consistency:.2f}\n'
+        )
+    for name, each in (('ATE', ratios), ('smoothed', smoothed), ('ANEES', anees)):
+        if each:
+            median, worst = np.percentile(each, [50, 90])
+            sys.stdout.write(f'{name} {median:.2f}, {worst:.2f} (median, 90 %)\n')
+    sys.stdout.write(f'halls, kind {kind}: {entered} of {count} entered, {wrong} far off\n')
+
+
+def smooth(estimator: Estimator) -> Trajectory:
+    """Return the smoothed trajectory."""
+    smoothed = estimator.smooth()
+    return Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
+
+
+def write_straight(kind: int, seeds: Sequence[int]) -> None:
+    """Write how many landmarks have entered in straight drives, and on the wrong side."""
+    entered = wrong = open_ = count = 0
+    for seed in seeds:
+        hall = Hall.random(seed, kind, duration_s=25.0, straight=True)
+        estimator, *_ = hall.drive(is_surveyed=False)
+        y = estimator.world_points[:, 1], hall.points[estimator.landmark_ids, 1]
+        entered, count = entered + len(y[0]), count + len(hall.points)
+        wrong += int(((y[0] * y[1] < 0.0) & (np.abs(y[0] - y[1]) > 1.0)).sum())
+        open_ += len(estimator.open_sides)
+    sys.stdout.write(
+        f'straight, kind {kind}: {entered} of {count} entered, {wrong} on the wrong side, '
+        f'{open_} open\n'
+    )
 
 
 def row(run: int, is_surveyed: bool) -> str:

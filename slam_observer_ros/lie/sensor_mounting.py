@@ -30,6 +30,10 @@ MEASURED = np.array(
 )
 """Which of range, azimuth and elevation is measured, by kind of point."""
 
+UNMEASURED_M = 1e3
+"""Standard deviation of a completed point where nothing was measured: as large as a message may
+state one."""
+
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -98,8 +102,23 @@ def directions_of(lines: FloatArray) -> FloatArray:
     return directions
 
 
+def measured_axes(shown: FloatArray, expected: FloatArray, kinds: IntArray) -> BoolArray:
+    """Return along which :func:`directions_of` expected lines (m, 3) points are known, (m, 3).
+
+    A landmark expected behind what shows its direction is known not to be there, either.
+    """
+    measured = MEASURED[kinds]
+    behind = measured[:, 1] & (np.einsum('mi,mi->m', shown, expected) < 0.0)
+    axes: BoolArray = measured | behind[:, None]
+    return axes
+
+
 def completed_lines(shown: FloatArray, expected: FloatArray, kinds: IntArray) -> FloatArray:
-    """Return lines of sight (m, 3) of what is shown, and where that is not measured, expected."""
+    """Return lines of sight (m, 3) of what is shown, and where that is not measured, expected.
+
+    They are uncertain along the expected line, not along the shown one: that would be turned by
+    the noise of each direction, and all landmarks drawn to the robot.
+    """
     measured_range, measured_azimuth, measured_elevation = MEASURED[kinds].T
     level = np.hypot(expected[:, 0], expected[:, 1])
     source = np.where(measured_azimuth[:, None], shown, expected)

@@ -86,6 +86,7 @@ class Smoother:
         self._link_information = _link_information(keyframes, drifts)
         self._prior_information = inverse(prior.covariance)
         self._is_usual = not axes.turn and not drifts
+        self._as_given = self._observations
         self._are_half = np.flatnonzero(keyframes.kinds != POINT)
 
     def smooth(
@@ -110,7 +111,7 @@ class Smoother:
 
     def _complete(self, solution: Solution) -> None:
         """Complete half points by a solution."""
-        keyframes, sensed = self._observations.completed(solution, self._are_half)
+        keyframes, sensed = self._as_given.completed(solution, self._are_half)
         self._keyframes, self._sensed = keyframes, sensed
         self._observations = Observations(self._axes, keyframes, self._settings, sensed)
 

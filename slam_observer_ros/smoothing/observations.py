@@ -20,10 +20,13 @@ from slam_observer_ros.lie.matrices import transpose
 from slam_observer_ros.lie.sensor_mounting import (
     completed_lines,
     directions_of,
+    MEASURED,
+    measured_axes,
     Sensed,
     sensitivity,
     shown_at,
     turning,
+    UNMEASURED_M,
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
@@ -79,7 +82,7 @@ class SensedPoints:
     ) -> tuple[SensedPoints, FloatArray, FloatArray]:
         """Return the same with points ``half`` (h,) as predicted (h, 3) where not measured.
 
-        And their lines of sight (h, 3) before and after, body frame.
+        And their lines of sight (h, 3) as shown and as expected, body frame.
         """
         values, sensed = self._values(calibrations)[half], self._sensed
         R, scales = so3.exp(values[:, :3]), np.exp(values[:, 6:])
@@ -88,10 +91,10 @@ class SensedPoints:
         expected = (transpose(R) @ lines[:, :, None])[:, :, 0] / scales
         arms = sensed.arms.copy()
         arms[half] = completed_lines(arms[half], expected, kinds)
-        before, after = ((R @ each[half, :, None])[:, :, 0] for each in (sensed.arms, arms))
+        before = scales * (R @ sensed.arms[half, :, None])[:, :, 0]
         shown, c = replace(sensed, arms=arms), calibrations.shape[1]
         changed = SensedPoints(shown, *self._of_sensors, c)
-        return changed, scales * before, scales * after
+        return changed, before, lines
 
     def turns(self, calibrations: FloatArray) -> FloatArray:
         """Return exp(ψ) (M, 3, 3), by which seen orientations are turned."""
@@ -173,15 +176,14 @@ class Observations:
             origins = keyframes.origins[half]
             before, expected = points[half] - origins, predicted - origins
             expected[:, k:] = 0.0
-            after = completed_lines(before, expected, kinds)
             points = points.copy()
-            points[half] = origins + after
+            points[half] = origins + completed_lines(before, expected, kinds)
         else:
-            sensed, before, after = sensed.completed(
+            sensed, before, expected = sensed.completed(
                 half, self._calibrations(solution), predicted, kinds, k
             )
         information = keyframes.information.copy()
-        information[half] = _along(before, after, information[half])
+        information[half] = _expected(before, expected, information[half], kinds)
         return replace(keyframes, points=points, information=information), sensed
 
     def some_are_gated(self, solution: Solution) -> bool:
@@ -275,20 +277,25 @@ def _joined(
     return np.concatenate([by_pose, unseen, by_sensors, by_landmark], axis=2)
 
 
-def _along(before: FloatArray, after: FloatArray, information: FloatArray) -> FloatArray:
-    """Return the information (h, k, k) of points on other lines of sight (h, 3).
+def _expected(
+    shown: FloatArray, expected: FloatArray, information: FloatArray, kinds: IntArray
+) -> FloatArray:
+    """Return the information (h, k, k) of half points about expected lines of sight (h, 3).
 
-    Along, in azimuth and in elevation it is as before; angles stay as well known as they were.
+    It is as much as it was about shown ones; angles stay as well known as they were.
     """
     k = information.shape[1]
-    lines = [each * (np.arange(3) < k) for each in (before, after)]
-    old, new = (directions_of(each)[:, :, :k] for each in lines)
-    lengths = [np.maximum(np.linalg.norm(each, axis=1), LEAST_M) for each in lines]
-    shares = np.ones((len(before), 3, 1))
-    shares[:, 1:, 0] = (lengths[0] / lengths[1])[:, None]
-    turned = transpose(new) @ (shares * old)
-    along: FloatArray = turned @ information @ transpose(turned)
-    return along
+    flat = np.arange(3) < k
+    shown, expected = shown * flat, expected * flat
+    old, new = (directions_of(each)[:, :, :k] for each in (shown, expected))
+    lengths = [np.maximum(np.linalg.norm(each, axis=1), LEAST_M) for each in (shown, expected)]
+    known = np.einsum('mij,mjk,mik->mi', old, information, old) * MEASURED[kinds]
+    known *= (np.trace(information, axis1=1, axis2=2) / known.sum(axis=1))[:, None]
+    known[:, 1:] *= ((lengths[0] / lengths[1]) ** 2)[:, None]
+    along = np.where(MEASURED[kinds], known, known.max(axis=1, keepdims=True))
+    known = np.where(measured_axes(shown, expected, kinds), along, UNMEASURED_M**-2)
+    turned: FloatArray = transpose(new) @ (known[:, :, None] * new)
+    return turned
 
 
 def normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -28,7 +28,13 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.filter.robust import straight_odds, straight_share
 from slam_observer_ros.lie.matrices import diagonal_blocks
-from slam_observer_ros.lie.sensor_mounting import completed_lines, directions_of, MEASURED
+from slam_observer_ros.lie.sensor_mounting import (
+    completed_lines,
+    directions_of,
+    MEASURED,
+    measured_axes,
+    UNMEASURED_M,
+)
 from slam_observer_ros.models.calibration import SCALE
 from slam_observer_ros.models.point_noise import point_covariances
 from slam_observer_ros.tracking.matching import calibrated, residuals_of
@@ -36,7 +42,6 @@ from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.waiting_room import (
     LEAST_MOVE_M,
     sensor_values,
-    UNMEASURED_M,
     WaitingRoom,
     Window,
 )
@@ -319,7 +324,9 @@ def _completed(
         expected[known] = expected_lines(state, event.select(known), rows[known])
     kinds = of_axes(event.kinds, state)
     lines = completed_lines(shown, expected, kinds)
-    return lines, _covariances(state, event, lines, kinds)
+    whole = kinds == POINT
+    expected[whole] = lines[whole]
+    return lines, _covariances(state, event, expected, kinds)
 
 
 def of_axes(kinds: IntArray | None, state: State) -> IntArray:
@@ -345,7 +352,7 @@ def expected_lines(state: State, event: ObservationEvent, rows: IntArray) -> Flo
 def _covariances(
     state: State, event: ObservationEvent, lines: FloatArray, kinds: IntArray
 ) -> FloatArray:
-    """Return covariances (m, 3, 3) of lines of sight: as measured, and anywhere else."""
+    """Return covariances (m, 3, 3) about expected lines of sight (m, 3), as far as measured."""
     noise = state.observation_noise
     modelled = point_covariances(lines, noise.figures)
     basis, lengths = directions_of(lines), np.linalg.norm(lines, axis=1)
@@ -359,7 +366,8 @@ def _covariances(
         of_shown[is_unit, 1:] *= lengths[is_unit, None] ** 2
         is_stated = stated.any(axis=(1, 2))
         variances[is_stated] = of_shown[is_stated]
-    variances = np.where(MEASURED[kinds], variances, UNMEASURED_M**2)
+    is_measured = measured_axes(event.lines_of_sight, lines, kinds)
+    variances = np.where(is_measured, variances, UNMEASURED_M**2)
     covariances: FloatArray = np.einsum('mij,mi,mik->mjk', basis, variances, basis)
     if stated is not None:
         whole = (kinds == POINT) & stated.any(axis=(1, 2))

@@ -22,7 +22,7 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, RANGE
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.lie.sensor_mounting import directions_of, MEASURED, Sensed
+from slam_observer_ros.lie.sensor_mounting import directions_of, MEASURED, Sensed, UNMEASURED_M
 from slam_observer_ros.smoothing.history import Keyframe
 
 if TYPE_CHECKING:
@@ -55,10 +55,6 @@ The odds of the side are e^15 then, beside errors of the way that are twice as s
 
 SIDE = 3.0
 """Times the noise of the way by which views lie off a straight line, if that decides a side."""
-
-UNMEASURED_M = 1e3
-"""Standard deviation of a completed point where nothing was measured: as large as a message may
-state one."""
 
 MOST_AT_ONCE = 4
 """Sensors, or kinds of views of one, that may show a landmark at once."""

@@ -162,6 +162,16 @@ def test_new_landmarks_enter_when_a_curve_has_decided_where_they_are(kind, seed)
     assert (off_m < np.minimum(4.0 * sigmas_m, 1.0)).all()
 
 
+def test_a_map_by_bearings_keeps_its_size():
+    # Each direction's noise would draw the landmarks to the robot, and the way with them.
+    settings = replace(SETTINGS, bearing_noise=0.05, linear_scale_stddev=(0.03, 0.0, 0.0))
+    world = World(settings, known=False)
+    world.drive(60.0, [BEARING], rows=range(N))
+    (scale,) = (e for e in world.estimator.calibration if e.name == 'linear_scale_x')
+    assert scale.value == pytest.approx(1.0, abs=0.1)
+    assert world.errors[-1] < 1.0
+
+
 def test_a_straight_way_leaves_open_on_which_side_an_anchor_is():
     world = World(SETTINGS, known=False, turn=0.0)
     world.drive(30.0, [RANGE], rows=range(N))
