@@ -79,7 +79,10 @@ class Parser(argparse.ArgumentParser):
         """Refuse what is not known here, where the command whose help says more is known."""
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            meant = suggestion(unknown[0].partition('=')[0], self._option_string_actions)
+            # By their names: dashes alone make any two options alike.
+            options = [option.lstrip('-') for option in self._option_string_actions]
+            meant = suggestion(unknown[0].partition('=')[0].lstrip('-'), options)
+            meant = meant.replace("'", "'--", 1)
             self.error(f'unrecognized arguments: {" ".join(unknown)}{meant}')
         return namespace, unknown
 

@@ -57,6 +57,7 @@ def test_help_names_what_a_robot_needs_first_before_the_advanced_parameters(
         ('replay . --json', 'no rosbag2 directory'),
         ('replay nothing.mcap --jsn', "'--json'?; see 'slam-observer replay --help'"),
         ('replay nothing.mcap --gain constant', "--gain constant; did you mean '--gains'?"),
+        ('replay nothing.mcap --params a.yaml', "--params a.yaml; see 'slam-observer replay"),
         ('replay nothing.mcap --gains best', "--gains: invalid choice: 'best'"),
         (
             'replay nothing.mcap --config nowhere',
