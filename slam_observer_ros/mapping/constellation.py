@@ -107,16 +107,22 @@ class _Search:
 
     def _find(self, matches: int) -> bool:
         """Find all places with so many matches; return whether that could be done."""
-        bases = self.sides.bases(matches)
-        sets = [self._sets(base) for base in bases]
-        if any(rows is None for rows in sets):
-            return False
-        which = np.repeat(np.arange(len(bases)), [len(rows) for rows in sets if rows is not None])
-        rows = np.concatenate([rows for rows in sets if rows is not None])
-        gates = _Gates(bases, self.known, self.seen)
+        bases, sets = [], []
+        for base in self.sides.bases(matches):
+            rows = self._sets(base)
+            if rows is None:
+                return False
+            if len(rows):
+                bases.append(base)
+                sets.append(rows)
+        if not bases:
+            return True
+        which = np.repeat(np.arange(len(bases)), [len(rows) for rows in sets])
+        base_rows = np.concatenate(sets)
+        gates = _Gates(np.array(bases), self.known, self.seen)
         for first in range(0, len(which), AT_ONCE):
             part = slice(first, first + AT_ONCE)
-            placed = self._look_for_others(gates, which[part], rows[part], matches)
+            placed = self._look_for_others(gates, which[part], base_rows[part], matches)
             if placed is None or not self._weigh(*placed):
                 return False
             if self._is_undecided():
