@@ -166,6 +166,8 @@ class ObservationEvent:
     # (m,) such as tag36h11, of fiducials whose poses are on /tf: points are NaN until looked up.
     families: tuple[str, ...] | None = None
     kinds: IntArray | None = None  # (m,) POINT to AZIMUTH_RANGE; None where all are whole points
+    # (m, 3, 3) unit vectors along which completed points are measured, as rows, others zero
+    directions: FloatArray | None = None
     # (m, 2) where an image shows them: points are NaN until the camera is looked up.
     pixels: FloatArray | None = None
 
@@ -177,6 +179,7 @@ class ObservationEvent:
             self,
             points=se3.transform(pose, self.points),
             covariances=None if self.covariances is None else _turned(self.covariances, R),
+            directions=None if self.directions is None else self.directions @ R.T,
             velocities=None if self.velocities is None else se3.rotate(pose, self.velocities),
             sensor=se3.transform(pose, sensor),
             sensor_axis=None if self.sensor_axis is None else R @ self.sensor_axis,
@@ -248,7 +251,7 @@ def _turned(covariances: FloatArray, R: FloatArray) -> FloatArray:
 
 _OF_POINTS = (
     'ids', 'points', 'covariances', 'velocities', 'sensor', 'orientations',
-    'orientation_covariances', 'kinds', 'pixels',
+    'orientation_covariances', 'kinds', 'directions', 'pixels',
 )  # fmt: skip
 _PLANAR_VELOCITY = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
 _PLANAR_POINT = np.array([1.0, 1.0, 0.0])

@@ -29,8 +29,17 @@ from slam_observer_ros.cli.doctor import shipped_settings
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import BEARING, Event, ObservationEvent, RANGE, VelocityEvent
-from slam_observer_ros.lie import se3
+from slam_observer_ros.events import (
+    AZIMUTH,
+    AZIMUTH_RANGE,
+    BEARING,
+    Event,
+    ObservationEvent,
+    POINT,
+    RANGE,
+    VelocityEvent,
+)
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.recordings.data_sets import load_plaza
 from slam_observer_ros.recordings.trajectory import Trajectory
@@ -54,22 +63,31 @@ HALL = Settings(
     max_rejections=1_000_000,
 )
 
+WORLDS = {
+    'ranges': (RANGE,),
+    'bearings': (BEARING,),
+    'mixed': (POINT, BEARING, AZIMUTH, RANGE, AZIMUTH_RANGE),
+    'points': (POINT,),
+}
+
 Found: TypeAlias = tuple[float, float, bool]
 """Metres driven, error of the position there, metres, and whether the robot was found."""
 
 
 def main() -> None:
-    """Print a row for each run, in the surveyed map and without one."""
+    """Print a row for each run, in the surveyed map and without one; or of random worlds."""
     logging.getLogger('slam_observer_ros').setLevel(logging.CRITICAL)
     parser = argparse.ArgumentParser(description=__doc__)
     for name, help_ in (
         ('random', 'how many halls of each kind'),
         ('straight', 'how many straight drives of each kind'),
+        ('worlds', 'how many surveyed worlds of each kind'),
         ('first', 'the first seed'),
     ):
         parser.add_argument(f'--{name}', type=int, default=0, help=help_)
     given = parser.parse_args()
-    if given.random or given.straight:
+    write_worlds(range(given.first, given.first + given.worlds))
+    if given.random or given.straight or given.worlds:
         for kind in (RANGE, BEARING):
             write_halls(kind, range(given.first, given.first + given.random))
             write_straight(kind, range(given.first, given.first + given.straight))
@@ -323,6 +341,86 @@ def write_straight(kind: int, seeds: Sequence[int]) -> None:
         f'straight, kind {kind}: {entered} of {count} entered, {wrong} on the wrong side, '
         f'{open_} open\n'
     )
+
+
+def write_worlds(seeds: Sequence[int]) -> None:
+    """Write how honest the filter is in surveyed random worlds: the mean NEES, and the worst."""
+    for is_planar in (True, False) if seeds else ():
+        for name, kinds in WORLDS.items():
+            each = np.array([surveyed_world(seed, is_planar, kinds) for seed in seeds])
+            (anees, error_m), worst = each.mean(axis=0), each[:, 0].max()
+            sys.stdout.write(
+                f'{"plane" if is_planar else "space"}, {name}: ANEES {anees:.2f}, worst world '
+                f'{worst:.2f}, error {error_m:.3f} m\n'
+            )
+            sys.stdout.flush()
+
+
+def surveyed_world(seed: int, is_planar: bool, kinds: Sequence[int]) -> tuple[float, float]:
+    """Drive for 100 s past eight anchors; return the mean NEES per axis, and the RMSE, metres."""
+    rng, n = np.random.default_rng(seed), 8
+    flat = np.array([1.0, 1.0, 0.0 if is_planar else 1.0])
+    points = rng.uniform([-10.0, -10.0, 0.5], [10.0, 10.0, 5.0], (n, 3)) * flat
+    noise = np.array([0.01, 0.01, 0.01, 0.02, 0.01, 0.01]) / np.sqrt(STEP_S)
+    counting = [2, 3, 4] if is_planar else list(range(6))
+    config = replace(HALL, two_d_mode=is_planar, range_scale_stddev=0.0, reorder_window=0.0)
+    estimator = Estimator(config)
+    survey = LandmarkMap(
+        np.arange(n), points, np.tile(1e-6 * np.eye(3), (n, 1, 1)), np.zeros(n, np.int64)
+    )
+    start = np.diag(np.array([0.02, 0.02, 0.1, 0.2, 0.2, 0.2]) ** 2)
+    A = se3.exp(
+        np.where(np.isin(np.arange(6), counting), np.sqrt(np.diagonal(start)), 0.0)
+        * rng.normal(size=6)
+    )
+    estimator.load_map(survey, np.eye(4), start)
+    nees, squares = [], []
+    for step in range(round(100.0 / STEP_S)):
+        if step % 20 == 0:
+            # Towards the middle wherever it is far from it.
+            ahead = (-A[:3, 3]) @ A[:3, :3]
+            turn = rng.uniform(-0.5, 0.5)
+            if np.linalg.norm(A[:2, 3]) > 6.0:
+                turn = 0.5 * np.sign(ahead[1])
+        V = np.array([0.0, 0.0, turn, SPEED, 0.0, 0.0])
+        if not is_planar:
+            V[5] = 0.1 * math.sin(0.05 * step)
+        stamp_ns = round(1e9 * STEP_S) * step
+        is_counting = np.isin(np.arange(6), counting)
+        estimator.add(VelocityEvent(stamp_ns, V + is_counting * noise * rng.normal(size=6)))
+        if step % 4 == 0:
+            estimator.add(shown_at(rng, stamp_ns, A, points, kinds, flat))
+            pose, P = estimator.pose, np.asarray(estimator.pose_covariance)
+            off_m = (pose - A)[:3, 3]
+            error = np.append(so3.log(pose[:3, :3] @ A[:3, :3].T), off_m)[counting]
+            P = P[np.ix_(counting, counting)]
+            nees.append(float(error @ np.linalg.solve(P, error)) / len(counting))
+            squares.append(float(off_m @ off_m))
+        A = A @ se3.exp(STEP_S * V)
+    return float(np.mean(nees)), math.sqrt(float(np.mean(squares)))
+
+
+def shown_at(
+    rng: np.random.Generator,
+    stamp_ns: int,
+    A: FloatArray,
+    points: FloatArray,
+    kinds: Sequence[int],
+    flat: FloatArray,
+) -> ObservationEvent:
+    """Return three points at random, each of one of the kinds, as seen from the base."""
+    rows = rng.permutation(len(points))[:3]
+    lines = se3.transform(se3.inverse(A), points[rows])
+    ranges_m = np.linalg.norm(lines, axis=1, keepdims=True)
+    across = np.cross(lines / ranges_m, rng.normal(size=(3, 3)) * 0.02)
+    units = lines / ranges_m + across * flat
+    units /= np.linalg.norm(units, axis=1, keepdims=True)
+    ranges_m = ranges_m + 0.1 * rng.normal(size=(3, 1))
+    of_each = rng.choice(kinds, 3)
+    is_range = (of_each == RANGE)[:, None]
+    has_range = np.isin(of_each, (POINT, RANGE, AZIMUTH_RANGE))[:, None]
+    shown = np.where(is_range, [1.0, 0.0, 0.0], units) * np.where(has_range, ranges_m, 1.0)
+    return ObservationEvent(stamp_ns, rows, shown, kinds=of_each)
 
 
 def row(run: int, is_surveyed: bool) -> str:

@@ -41,7 +41,7 @@ from slam_observer_ros.mapping.landmark_map import heights_of, LandmarkMap
 from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import checked, table
-from slam_observer_ros.tracking.half_points import judged
+from slam_observer_ros.tracking.half_points import with_kinds
 
 logger = logging.getLogger(__name__)
 
@@ -349,7 +349,7 @@ class Estimator(Estimate):
             self._placement.doubt(*self.uncertain_pose)
         update = self._hypotheses.observe(event)
         if event.kinds is not None:
-            update = judged(update, event, self._state)
+            update = with_kinds(update, event)
             if self._half_points.remember(self._hypotheses.states):
                 update = replace(update, pose=self._state.observer.pose)
         self._timeline.judge_standing(event, update)

@@ -184,7 +184,7 @@ static const char *const LANDMARKS[] = {"Ln", "Ln", "Ln", "Ln", NULL};
 typedef struct {
     i64 stamp_ns;
     const i64 *rows;
-    const double *arms, *origins, *covariances, *sensor;
+    const double *arms, *origins, *covariances, *directions, *sensor;
     const i64 *of_sensor;
     i64 column;
     const double *D;
@@ -192,7 +192,7 @@ typedef struct {
 } Seen;
 
 static int read_seen(Door *door, PyObject *tuple, const FilterState *x, Seen *seen) {
-    static const char *const specs[] = {"i",     "xm", "dm3", "~dm3",  "~dm33",
+    static const char *const specs[] = {"i",   "xm", "dm3", "~dm3",  "~dm33", "~dm33",
                                         "~d7", "xs", "i",   "~dm3c", NULL};
     if (!read_fields(door, tuple, specs, seen, "Seen"))
         return 0;
@@ -620,10 +620,12 @@ static int advance(const FilterState *x, const Velocities *v, const Interval *in
 /* What m known landmarks say against the state, reference frame, k axes: M = m k, q = p + c. */
 typedef struct {
     long m, M, q;
-    int k, has_sensor;
+    int k, has_sensor, has_halves;
     i64 *rows, *at;          /* (m) which landmarks are seen, and by which of the points */
     double *points, *stated; /* (m, 3) estimated; of all points covariances as stated, body frame */
-    double *r, *R;           /* (M); (m, k, k) */
+    double *off;             /* (M) r along the estimated axes */
+    double *directions;      /* (m, k, k) along which points are measured, as rows, others zero */
+    double *r, *R;           /* (M); (m, k, k): along these */
     double *D;               /* (M, c) how r changes with the calibration */
     double *repeated;        /* (m) by how much R grows, as errors last */
     double *predicted, *S, *L, *z, *S_inv_r; /* (M, M) C P C' and with noise, its factor; (M) */
@@ -640,7 +642,8 @@ static size_t lay_out(Residuals *res, const FilterState *x, long m, long of_all,
     size_t used = 0;
     res->m = m, res->M = (long)M, res->q = (long)q, res->k = x->k;
 #define TAKE(field, count) (res->field = memory ? memory + used : NULL, used += (count))
-    TAKE(points, 3 * n), TAKE(stated, 9 * (size_t)of_all), TAKE(r, M), TAKE(R, M * k), TAKE(D, M * c);
+    TAKE(points, 3 * n), TAKE(stated, 9 * (size_t)of_all), TAKE(off, M), TAKE(directions, M * k);
+    TAKE(r, M), TAKE(R, M * k), TAKE(D, M * c);
     TAKE(repeated, n), TAKE(predicted, M * M), TAKE(S, M * M), TAKE(L, M * M), TAKE(z, M);
     TAKE(S_inv_r, M), TAKE(C, M * q), TAKE(T, M * q), TAKE(half, q), TAKE(W, M * (size_t)x->N);
     TAKE(dx, (size_t)x->N), TAKE(weights, n);
@@ -749,6 +752,50 @@ static int is_sure(const Landmarks *table, i64 row, i64 further, const Limits *l
     return count >= limits->confirmations && table->rejections[row] < needed - further;
 }
 
+/* Rows (k, width) of a point along the estimated axes as they are along what is measured of it.
+ * Rows of what is not measured are zero: with a variance of 1 they say nothing. */
+static void measure(const double *directions, int k, double *rows, long width, long stride) {
+    for (long j = 0; j < width; j++) {
+        double along[3] = {0.0};
+        for (int b = 0; b < k; b++)
+            for (int t = 0; t < k; t++)
+                along[b] += directions[k * b + t] * rows[t * stride + j];
+        for (int b = 0; b < k; b++)
+            rows[b * stride + j] = along[b];
+    }
+}
+
+/* The same of all points' rows (M, width). */
+static void measure_rows(const Residuals *res, double *rows, long width, long stride) {
+    int k = res->k;
+    for (long i = 0; i < res->m && res->has_halves; i++)
+        measure(res->directions + k * k * i, k, rows + k * i * stride, width, stride);
+}
+
+static void measure_columns(const Residuals *res, double *square) { /* of a matrix (M, M) */
+    for (long i = 0; i < res->M; i++)
+        measure_rows(res, square + i * res->M, 1, 1);
+}
+
+static int is_measured(const Residuals *res, long entry) {
+    return !res->has_halves || !is_zero(res->directions + res->k * entry, res->k);
+}
+
+/* The directions of a point of ``seen``, on k axes of the reference frame, and r and R by them. */
+static void fill_measured(const Pose *pose, const double seen[9], Residuals *res, long i) {
+    int k = res->k;
+    double in_reference[9], *directions = res->directions + k * k * i, *R = res->R + k * k * i;
+    times_transposed(seen, pose->R, in_reference);
+    for (int b = 0; b < k; b++)
+        memcpy(directions + k * b, in_reference + 3 * b, (size_t)k * sizeof(double));
+    measure(directions, k, res->r + k * i, 1, 1);
+    measure(directions, k, R, k, k);
+    for (int b = 0; b < k; b++)
+        measure(directions, k, R + k * b, 1, 1);
+    for (int b = 0; b < k; b++)
+        R[(k + 1) * b] += !is_measured(res, k * i + b);
+}
+
 /* (29)  e_i = A y_i - a_i,  r_i = e_i - y_i°; 0 where a stamp is none. Of those that passed the gate
  * if that has been judged, else of all, whose weights begin with 0. */
 static int fill_residuals(const FilterState *x, const Landmarks *table, const Seen *seen,
@@ -759,6 +806,7 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
     int k = x->k;
     long i = 0;
     res->has_sensor = (seen->sensor != NULL && seen->c_s > 0) || seen->D != NULL;
+    res->has_halves = seen->directions != NULL;
     if (seen->sensor != NULL) {
         exp_and_jacobian(seen->sensor, turned, J);
         for (int e = 0; e < 9; e++)
@@ -801,10 +849,12 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
         double in_reference[9];
         turned_covariance(pose.R, C, in_reference);
         for (int b = 0; b < k; b++) {
-            res->r[k * i + b] = r[b];
+            res->off[k * i + b] = res->r[k * i + b] = r[b];
             for (int t = 0; t < k; t++)
                 res->R[k * k * i + k * b + t] = in_reference[3 * b + t];
         }
+        if (seen->directions)
+            fill_measured(&pose, seen->directions + 9 * j, res, i);
         if (seen->sensor != NULL && seen->c_s > 0)
             fill_sensitivity(x, seen, pose.R, J, expected, res->D + k * x->c * i);
         else if (seen->D != NULL)
@@ -847,7 +897,7 @@ static void fill_output(const FilterState *x, double chord, Residuals *res) {
     for (long i = 0; i < res->m; i++) {
         double from[3] = {0.0}, *C = res->C + k * i * res->q;
         for (int b = 0; b < 3; b++)
-            from[b] = (b < k ? chord * res->r[k * i + b] : 0.0)
+            from[b] = (b < k ? chord * res->off[k * i + b] : 0.0)
                       + (x->stride ? 0.0 : res->points[3 * i + b]);
         output_matrix(from, x->p, C, res->q);
         for (int b = 0; b < k && res->has_sensor; b++)
@@ -878,6 +928,8 @@ static void fill_predicted(const FilterState *x, Residuals *res) {
             res->predicted[i * M + j] = res->predicted[j * M + i] = sum;
         }
     }
+    measure_rows(res, res->predicted, M, M);
+    measure_columns(res, res->predicted);
 }
 
 /* L L' = S, z = L^-1 r and S^-1 r; 0 where S is indefinite. */
@@ -930,7 +982,8 @@ static void write_densities(const Residuals *res, long of_all, double *judged) {
     for (long i = 0; i < res->m; i++) {
         double sum = 0.0;
         for (long e = k * i; e < k * (i + 1); e++)
-            sum += 0.5 * res->z[e] * res->z[e] + log(res->L[e * res->M + e]) + LOG_ROOT_2_PI;
+            sum += 0.5 * res->z[e] * res->z[e] + log(res->L[e * res->M + e])
+                   + (is_measured(res, e) ? LOG_ROOT_2_PI : 0.0);
         judged[of_all + res->at[i]] = -sum;
     }
     judged[3 * of_all] = sum_of_squares(res->z, res->M);
@@ -1006,8 +1059,10 @@ static int learn(const FilterState *x, const Factors *factors, double gate, cons
             double middle[3];
             for (int b = 0; b < 3; b++)
                 middle[b] = res->points[3 * (at[i] / k) + b]
-                            + (b < k ? 0.5 * res->r[at[i] + b] : 0.0);
+                            + (b < k ? 0.5 * res->off[at[i] + b] : 0.0);
             output_matrix(middle, p, Y + i * p, p);
+            if (res->has_halves)
+                measure(res->directions + k * at[i], k, Y + i * p, p, p);
         }
         for (long i = 0; i < M; i++) {
             double half[6] = {0.0};
@@ -1045,7 +1100,10 @@ static int learn(const FilterState *x, const Factors *factors, double gate, cons
             for (int t = 0; t < p; t++)
                 G[p * s + t] += Y[i * p + s] * Y[i * p + t];
         }
-    double root = sqrt(2.0 * (double)M - 1.0) + RARE;
+    long measured = 0;
+    for (long i = 0; i < M; i++)
+        measured += is_measured(res, at[i]);
+    double root = sqrt(2.0 * (double)measured - 1.0) + RARE;
     score(u, G, N, p, squared, 0.5 * root * root, g, F);
     step_factors(factors, g, F, logs, information);
     return 1;
@@ -1119,6 +1177,7 @@ static int correct(const FilterState *x, Residuals *res, double *L) {
                 row[j] += share * of_t[j];
         }
     }
+    measure_rows(res, res->W, N, N);
     for (long i = 0; i < M; i++) /* H P H' */
         for (long j = 0; j < M; j++) {
             const double *row = res->W + i * N, *C = res->C + j * res->q;
@@ -1127,6 +1186,7 @@ static int correct(const FilterState *x, Residuals *res, double *L) {
                 sum += C[t] * row[t];
             res->predicted[i * M + j] = sum;
         }
+    measure_columns(res, res->predicted);
     with_noise(res, res->predicted, res->repeated, res->weights, L);
     if (!factor(L, M))
         return 0;

@@ -58,6 +58,9 @@ class Seen(NamedTuple):
     arms: FloatArray  # (m, 3) from the sensor to each point, metres
     origins: FloatArray | None  # (m, 3) where the sensor was, metres; None at the base
     covariances: FloatArray | None  # (m, 3, 3) as stated, m²; None where the figures have them
+    # (m, 3, 3) unit vectors along which points are measured, body frame, as rows, others zero;
+    # None where all are measured along all
+    directions: FloatArray | None
     sensor: FloatArray | None  # (7,) ψ, d and s of the sensor, rad and m
     of_sensor: IntArray  # (c_s,) which of ψ, d and s are estimated
     column: int  # of c̃ where they begin

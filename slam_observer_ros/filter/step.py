@@ -35,6 +35,7 @@ from slam_observer_ros.lie.matrices import (
     cholesky,
     diagonal_blocks,
     mahalanobis,
+    transpose,
     with_blocks,
 )
 from slam_observer_ros.lie.sensor_mounting import sensitivity as sensor_sensitivity
@@ -211,12 +212,32 @@ class _Residuals(NamedTuple):
     R: FloatArray  # (m, k, k) covariances of the points seen
     D: FloatArray | None  # (m, k, c) how r_i changes with the calibration; None if it does not
     repeated: FloatArray  # (m,) by how much R grows, as errors last
+    # (m, k, k) unit vectors along which points are measured, as rows, others zero; None: all
+    directions: FloatArray | None
     axes: EstimatedAxes
 
     @property
     def flat(self) -> FloatArray:
-        """(m k,) all residuals."""
-        return self.r[:, : self.axes.point].ravel()
+        """(m k,) all residuals, as far as points are measured."""
+        return self.measured(self.r[:, : self.axes.point].ravel())
+
+    @property
+    def degrees(self) -> IntArray:
+        """(m,) along how many directions points are measured."""
+        if self.directions is None:
+            return np.full(len(self.at), self.axes.point)
+        degrees: IntArray = np.asarray(self.directions.any(axis=2)).sum(axis=1)
+        return degrees
+
+    def measured(self, along_axes: FloatArray) -> FloatArray:
+        """Return rows (m k, …) along the estimated axes as they are along what is measured.
+
+        Rows of what is not measured are zero: with a variance of 1 they say nothing.
+        """
+        if self.directions is None:
+            return along_axes
+        of_points = along_axes.reshape(len(self.at), self.axes.point, -1)
+        return (self.directions @ of_points).reshape(along_axes.shape)
 
     def output_matrix(self, chord: float) -> FloatArray:
         """Return C (m k, q) of r_i = C_i (ε, c̃) − ξ_i, ``chord`` of the way from ŷ_i to y.
@@ -251,6 +272,7 @@ class _Residuals(NamedTuple):
             self.R[wanted],
             None if self.D is None else self.D[wanted],
             self.repeated[wanted],
+            None if self.directions is None else self.directions[wanted],
             self.axes,
         )
 
@@ -277,12 +299,14 @@ def observe(
         block = residuals.select(slice(start, start + AT_ONCE))
         block = block.changed(dx) if start else block
         predicted, S = _predicted(x, block)
-        passed = passing(block.r[:, :k], S, limits.gate)
+        r = block.flat.reshape(-1, k)
+        passed = passing(r, S, limits.gate)
         if limits.may_refuse and start == 0 and 2 * np.count_nonzero(passed) < len(passed):
             return REJECTS
         if factors is not None and start == 0:
             C = axes.output_matrix(block.points + 0.5 * block.r)
-            learn(factors, block.r[:, :k], S, C, limits.gate)
+            C = block.measured(C.reshape(-1, axes.p)).reshape(C.shape)
+            learn(factors, r, S, C, block.degrees, limits.gate)
         weights = np.zeros(len(passed))
         used = np.flatnonzero(np.repeat(passed, k))
         if len(out.judged):
@@ -290,7 +314,7 @@ def observe(
         if len(used):
             block = block.select(passed)
             weights[passed] = reweighted(
-                block.r[:, :k], predicted[np.ix_(used, used)], block.R, limits.huber
+                r[passed], predicted[np.ix_(used, used)], block.R, limits.huber
             )
             dx += _correct(x, block, weights[passed])
         out.weights[residuals.at[start : start + AT_ONCE]] = weights
@@ -346,14 +370,20 @@ def _residuals(
     dt_s = landmarks.unseen_s(rows, seen.stamp_ns)
     out.repeated[at] = repeated = repetition_factors(dt_s, limits.error_time_s)
     columns = x.first + np.arange(k) + x.stride * rows[:, None]
+    R, directions = (R_hat @ covariances @ R_hat.T)[:, :k, :k], None
+    if seen.directions is not None:
+        directions = np.ascontiguousarray((seen.directions[at] @ R_hat.T)[:, :k, :k])
+        unmeasured = np.asarray(~directions.any(axis=2))
+        R = directions @ R @ transpose(directions) + unmeasured[:, :, None] * np.eye(k)
     residuals = _Residuals(
         at,
         columns.ravel() if x.stride else np.empty(0, dtype=np.int64),
         points,
         r,
-        (R_hat @ covariances @ R_hat.T)[:, :k, :k],
+        R,
         D,
         repeated,
+        directions,
         axes,
     )
     return residuals, stated
@@ -400,6 +430,8 @@ def _predicted(x: FilterState, residuals: _Residuals) -> tuple[FloatArray, Float
         predicted += seen_P.take(columns, axis=1)
     else:
         predicted = C.dot(P[:q, :q]).dot(C.T)
+    if residuals.directions is not None:
+        predicted = residuals.measured(residuals.measured(predicted).T.copy())
     return predicted, with_blocks(predicted, residuals.R)
 
 
@@ -413,9 +445,12 @@ def _correct(x: FilterState, residuals: _Residuals, weights: FloatArray) -> Floa
     HP = C.dot(P[:q])
     if len(columns):
         HP -= P.take(columns, axis=0)
+    HP = residuals.measured(HP)
     HPH = HP[:, :q].dot(C.T)
     if len(columns):
         HPH -= HP.take(columns, axis=1)
+    if residuals.directions is not None:
+        HPH = residuals.measured(HPH.T.copy())
     S = with_blocks(HPH, residuals.R * (residuals.repeated / weights)[:, None, None])
     errors = np.append(np.arange(residuals.axes.p + len(x.drift)), np.arange(x.first, x.size))
     return -kalman_correction(P, x.size, errors, HP, S, residuals.flat)
@@ -430,15 +465,17 @@ def _write_judged(
     """
     k = residuals.axes.point
     distances, densities, shares = out[:-1].reshape(3, -1)
-    distances[residuals.at] = mahalanobis(residuals.r[:, :k], diagonal_blocks(S, k))
+    r = residuals.flat
+    distances[residuals.at] = mahalanobis(r.reshape(-1, k), diagonal_blocks(S, k))
     shares[residuals.at] = 1.0 / residuals.repeated
     densities[residuals.at] = -math.inf
     used = np.flatnonzero(np.repeat(passed, k))
     if len(used):
         L = cholesky(S[np.ix_(used, used)])
-        white = dtrsv(L, residuals.flat[used], lower=1)
+        white = dtrsv(L, r[used], lower=1)
         each = 0.5 * white**2 + np.log(np.diagonal(L)) + LOG_ROOT_2_PI
-        densities[residuals.at[passed]] = -each.reshape(-1, k).sum(axis=1)
+        unmeasured = LOG_ROOT_2_PI * (k - residuals.degrees[passed])
+        densities[residuals.at[passed]] = unmeasured - each.reshape(-1, k).sum(axis=1)
         out[-1] += white.dot(white)
 
 

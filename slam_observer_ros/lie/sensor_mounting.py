@@ -102,6 +102,13 @@ def directions_of(lines: FloatArray) -> FloatArray:
     return directions
 
 
+def unmeasured_covariances(directions: FloatArray) -> FloatArray:
+    """Return (m, 3, 3), m², of all but the rows of ``directions`` (m, 3, 3), unit vectors."""
+    unmeasured = np.eye(3) - directions.swapaxes(1, 2) @ directions
+    covariances: FloatArray = UNMEASURED_M**2 * unmeasured
+    return covariances
+
+
 def measured_axes(shown: FloatArray, expected: FloatArray, kinds: IntArray) -> BoolArray:
     """Return along which :func:`directions_of` expected lines (m, 3) points are known, (m, 3).
 

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_observer_ros.common.errors import significant
-from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.lie.matrices import (
     diagonal_blocks,
@@ -251,7 +251,8 @@ class MotionFactors:
         They are of the motions since the last time.
         """
         if (factors := self.flat()) is not None:
-            learn(factors, r, S, C, self._settings.rejection_threshold)
+            degrees = np.full(len(r), r.shape[1])
+            learn(factors, r, S, C, degrees, self._settings.rejection_threshold)
         self.take(factors)
 
     def flat(self) -> Factors | None:
@@ -279,8 +280,18 @@ class MotionFactors:
         self._shares = np.zeros(())
 
 
-def learn(factors: Factors, r: FloatArray, S: FloatArray, C: FloatArray, gate: float) -> None:
-    """Let factors learn from residuals r (m, k), with S (m k, m k) and C (m, k, p)."""
+def learn(
+    factors: Factors,
+    r: FloatArray,
+    S: FloatArray,
+    C: FloatArray,
+    degrees: IntArray,
+    gate: float,
+) -> None:
+    """Let factors learn from residuals r (m, k), with S (m k, m k) and C (m, k, p).
+
+    ``degrees`` (m,) of freedom have those; rows of others are zero but for a variance.
+    """
     # As the likelihood at θ has it, which may be less than is applied.
     ratios = np.exp(factors.logs) / factors.applied
     N = ratios[:, None, None] * factors.shares
@@ -288,14 +299,19 @@ def learn(factors: Factors, r: FloatArray, S: FloatArray, C: FloatArray, gate: f
     if np.count_nonzero(ratios != 1.0):
         S = S + C.dot((N - factors.shares).sum(axis=0)).dot(C.T)
     factors.information[:], factors.logs[:] = learnt(
-        factors.logs, factors.information, *gated_score(r, S, C, N, gate)
+        factors.logs, factors.information, *gated_score(r, S, C, N, degrees, gate)
     )
     if factors.least < math.inf:
         factors.applied[:] = np.exp(np.maximum(factors.logs, factors.least))
 
 
 def gated_score(
-    r: FloatArray, S: FloatArray, C: FloatArray, N: FloatArray, gate: float
+    r: FloatArray,
+    S: FloatArray,
+    C: FloatArray,
+    N: FloatArray,
+    degrees: IntArray,
+    gate: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return g (2,) and F (2, 2) of residuals r (m, k), without some few that are too far off."""
     solved = solve_definite(S, np.column_stack([r.ravel(), C]))
@@ -305,8 +321,10 @@ def gated_score(
         passed = mahalanobis(r, diagonal_blocks(S, k)) <= gate
         if m < 2 * np.count_nonzero(passed) < 2 * m:
             used = np.flatnonzero(np.repeat(passed, k))
-            return gated_score(r[passed], S[np.ix_(used, used)], C[used], N, gate)
-    return score(C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:]), N, squared, r.size)
+            S = S[np.ix_(used, used)]
+            return gated_score(r[passed], S, C[used], N, degrees[passed], gate)
+    q = int(degrees.sum())
+    return score(C.T.dot(solved[:, 0]), C.T.dot(solved[:, 1:]), N, squared, q)
 
 
 def proposed(name: str, factor: float, settings: Settings) -> str:

@@ -14,6 +14,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.matrices import limited
+from slam_observer_ros.lie.sensor_mounting import unmeasured_covariances
 from slam_observer_ros.models.point_noise import (
     point_covariances,
     PointFigures,
@@ -58,7 +59,11 @@ class ObservationNoise:
         lines_of_sight = event.lines_of_sight if lines_of_sight is None else lines_of_sight
         if event.covariances is None:
             return self.at(lines_of_sight)
-        return stated_covariances(event.points, event.covariances, lines_of_sight, self.figures)
+        stated = event.covariances
+        covariances = stated_covariances(event.points, stated, lines_of_sight, self.figures)
+        if event.directions is not None:
+            covariances += unmeasured_covariances(event.directions)
+        return covariances
 
     @property
     def error_time_s(self) -> float:

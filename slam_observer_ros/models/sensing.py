@@ -45,6 +45,7 @@ def calibrated(
         arms = arms / cosines(arms, event.sensor_axis)[:, None]
     sensed = Sensed(np.full(len(arms), number), origins, arms, event.orientations)
     covariances, velocities, R = event.covariances, event.velocities, so3.exp(values[:3])
+    directions = event.directions
     if covariances is not None:
         squared = np.einsum('ij,ij->i', arms, arms)
         shown = np.einsum('ij,ij->i', event.lines_of_sight, event.lines_of_sight)
@@ -52,7 +53,15 @@ def calibrated(
         covariances = longer[:, None, None] * (R @ covariances @ R.T)
     if velocities is not None:
         velocities = velocities @ R.T
-    event = replace(event, covariances=covariances, velocities=velocities, sensed=sensed)
+    if directions is not None:
+        directions = directions @ R.T
+    event = replace(
+        event,
+        covariances=covariances,
+        directions=directions,
+        velocities=velocities,
+        sensed=sensed,
+    )
     return calibrated_again(calibration, event)
 
 

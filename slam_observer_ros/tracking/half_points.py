@@ -3,8 +3,7 @@
 A half point is a point once there is something to complete it with: of a known landmark by the
 estimate, at each observation, which is where the residual is linearised; of a new one by the past
 (:mod:`.waiting_room`). In the directions that were not measured a completed point may be off by
-``UNMEASURED_M``: its residual there is zero, and says nothing. So rows H = uᵀ of the measured
-directions and a completed point are the same correction, but for rounding.
+``UNMEASURED_M``; a step takes the rows H = uᵀ of the directions that were measured alone.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from slam_observer_ros.lie.sensor_mounting import (
     directions_of,
     MEASURED,
     measured_axes,
-    UNMEASURED_M,
+    unmeasured_covariances,
 )
 from slam_observer_ros.models.calibration import SCALE
 from slam_observer_ros.models.point_noise import point_covariances
@@ -57,8 +56,6 @@ LEAST_SHARE = 1e-3
 
 LEAST_LEVEL = 0.1
 """Cosine of the steepest line of sight, 84°, whose range says something in the plane."""
-
-_LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class HalfPoints:
@@ -115,31 +112,34 @@ class HalfPoints:
         """
         if event.kinds is None or not (event.kinds != POINT).any():
             return event
-        # Zero residuals where nothing was measured would say that the motion is exact.
-        state.motion_noise.factors.forget_motion()
         event = _with_sensor(state, event)
         rows = state.landmarks.rows_of(event.ids)
-        lines, covariances = _completed(state, event, rows)
+        lines, covariances, directions = _completed(state, event, rows)
         entered = np.zeros(len(rows), dtype=np.bool_)
         is_sought = is_lost & np.isin(event.ids, self.mapped_ids)
         if is_sought.any():
-            _, measured = _completed(state, event, np.full(len(rows), -1))
+            _, measured, along = _completed(state, event, np.full(len(rows), -1))
+            measured = measured + unmeasured_covariances(along)
             for row in np.flatnonzero(is_sought).tolist():
                 self.window.add(state, event, row, measured[row])
         if state.is_mapping:
             is_new = (rows < 0) & (event.kinds != POINT) & ~is_sought
             self._waiting.begin(event.stamp_ns)
+            measured = covariances + unmeasured_covariances(directions)
             for row in np.flatnonzero(is_new).tolist():
-                found = self._waiting.add(state, event, row, covariances[row])
+                found = self._waiting.add(state, event, row, measured[row])
                 if found is not None:
                     lines[row], covariances[row] = found
+                    directions[row] = np.eye(3)
                     entered[row] = True
         usable = (rows >= 0) | (event.kinds == POINT) | entered
         self._counts.note(Reason.WAITING, event.ids[~usable], event.stamp_ns)
         kinds = np.asarray(event.kinds)
         kinds = np.where(entered, POINT, kinds)
         points = event.points - event.lines_of_sight + lines
-        whole = replace(event, points=points, covariances=covariances, kinds=kinds)
+        whole = replace(
+            event, points=points, covariances=covariances, kinds=kinds, directions=directions
+        )
         covariances = self._without_detours(state, whole, rows, event)
         return replace(whole, covariances=covariances).select(usable)
 
@@ -254,34 +254,13 @@ def _expected_covariances(
     return turned
 
 
-def judged(update: Update, event: ObservationEvent, state: State) -> Update:
-    """Return what came of a completed observation without the directions not measured."""
+def with_kinds(update: Update, event: ObservationEvent) -> Update:
+    """Return what came of an observation with the kinds of its points."""
     if event.kinds is None:
         return update
     by_id = dict(zip(event.ids.tolist(), event.kinds.tolist(), strict=True))
     kinds = np.array([by_id.get(each, POINT) for each in update.ids.tolist()], dtype=np.int64)
-    update, innovation = replace(update, kinds=kinds), update.innovation
-    if innovation is None:
-        return update
-    k = state.axes.point
-    missing = k - measured_directions(kinds, k)
-    unmeasured = missing * (math.log(UNMEASURED_M) + _LOG_ROOT_2_PI)
-    used = innovation.weights > 0.0
-    degrees = innovation.degrees_of_freedom
-    return replace(
-        update,
-        innovation=replace(
-            innovation,
-            degrees_of_freedom=max(degrees - int(missing[used].sum()), 0) if degrees else 0,
-            log_densities=innovation.log_densities + unmeasured,
-        ),
-    )
-
-
-def measured_directions(kinds: IntArray, k: int) -> IntArray:
-    """Return how many directions (m,) of points in k dimensions are measured, by kind."""
-    count: IntArray = MEASURED[kinds][:, :k].sum(axis=1)
-    return count
+    return replace(update, kinds=kinds)
 
 
 def _with_sensor(state: State, event: ObservationEvent) -> ObservationEvent:
@@ -313,10 +292,11 @@ def take_scales(state: State, lost: State, scales: Mapping[str, float]) -> None:
 
 def _completed(
     state: State, event: ObservationEvent, rows: IntArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return lines of sight (m, 3) as a sensor would have shown them, and their covariances.
 
-    Of landmarks that are not known, with what was measured alone.
+    And along which directions (m, 3, 3) they are measured. Of landmarks that are not known, with
+    what was measured alone.
     """
     shown, expected = event.lines_of_sight, event.lines_of_sight.copy()
     known = rows >= 0
@@ -326,7 +306,7 @@ def _completed(
     lines = completed_lines(shown, expected, kinds)
     whole = kinds == POINT
     expected[whole] = lines[whole]
-    return lines, _covariances(state, event, expected, kinds)
+    return lines, *_covariances(state, event, expected, kinds)
 
 
 def of_axes(kinds: IntArray | None, state: State) -> IntArray:
@@ -351,8 +331,8 @@ def expected_lines(state: State, event: ObservationEvent, rows: IntArray) -> Flo
 
 def _covariances(
     state: State, event: ObservationEvent, lines: FloatArray, kinds: IntArray
-) -> FloatArray:
-    """Return covariances (m, 3, 3) about expected lines of sight (m, 3), as far as measured."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return covariances (m, 3, 3) about expected lines of sight (m, 3), and what is measured."""
     noise = state.observation_noise
     modelled = point_covariances(lines, noise.figures)
     basis, lengths = directions_of(lines), np.linalg.norm(lines, axis=1)
@@ -367,9 +347,11 @@ def _covariances(
         is_stated = stated.any(axis=(1, 2))
         variances[is_stated] = of_shown[is_stated]
     is_measured = measured_axes(event.lines_of_sight, lines, kinds)
-    variances = np.where(is_measured, variances, UNMEASURED_M**2)
+    variances = np.where(is_measured, variances, 0.0)
     covariances: FloatArray = np.einsum('mij,mi,mik->mjk', basis, variances, basis)
+    directions = is_measured[:, :, None] * basis
+    directions[kinds == POINT] = np.eye(3)
     if stated is not None:
         whole = (kinds == POINT) & stated.any(axis=(1, 2))
         covariances[whole] = stated[whole]
-    return covariances
+    return covariances, directions

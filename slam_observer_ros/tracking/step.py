@@ -12,7 +12,8 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.flat_arrays import Limits, Observed, Seen
 from slam_observer_ros.filter.robust import accepted
-from slam_observer_ros.lie.sensor_mounting import Sensed
+from slam_observer_ros.lie import so3
+from slam_observer_ros.lie.sensor_mounting import Sensed, unmeasured_covariances
 from slam_observer_ros.models import sensing
 from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.smoothing.history import Keyframe
@@ -226,6 +227,7 @@ def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
     origins = event.sensor
     calibration = state.calibration
     values, estimated, column, D = None, NO_IDS, 0, None
+    directions = event.directions
     if event.sensed is not None:
         expected, known = event.points.copy(), rows >= 0
         expected[known] = state.observer.body_points(rows[known])
@@ -234,6 +236,8 @@ def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
         frame = event.sensor_frame
         values, estimated = calibration.sensor(frame), calibration.of_sensor
         column = calibration.columns(frame).start
+        if directions is not None:
+            directions = directions @ so3.exp(values[:3]).T
     if state.settings.range_is_depth and event.sensed is None:
         cosines = sensing.cosines(arms, event.sensor_axis)
         arms = arms / cosines[:, None]
@@ -245,6 +249,7 @@ def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
         arms,
         None if origins is None else _plain(origins),
         None if covariances is None else _plain(covariances),
+        None if directions is None else _plain(directions),
         values,
         estimated,
         column,
@@ -273,12 +278,15 @@ def keyframe(
         number = state.calibration.sensors.index(event.sensor_frame)
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(rows), number), origins, seen.arms, event.orientations)
+    covariances = out.covariances if len(out.covariances) else None
+    if covariances is not None and seen.directions is not None:
+        covariances = covariances + unmeasured_covariances(seen.directions)
     every = Keyframe(
         event.stamp_ns,
         rows,
         out.points,
         out.lines_of_sight,
-        out.covariances if len(out.covariances) else None,
+        covariances,
         out.repeated,
         turns,
         sensed,
@@ -299,7 +307,10 @@ def innovation_of(state: State, corrected: Corrected) -> NormalisedInnovation | 
         nothing, unlikely = np.zeros(len(weights)), np.full(len(weights), -np.inf)
         return NormalisedInnovation(nothing, weights, None, 0, unlikely, np.ones(len(weights)))
     distances, densities, shares = out.judged[:-1].reshape(3, -1)[:, known]
-    used = int(np.count_nonzero(weights))
-    nis = float(out.judged[-1]) if used else None
-    count = used * state.axes.point
-    return NormalisedInnovation(distances, weights, nis, count, densities, shares)
+    nis, used = float(out.judged[-1]), weights > 0.0
+    count, directions = int(np.count_nonzero(used)) * state.axes.point, corrected.seen.directions
+    if directions is not None:
+        count = int(np.count_nonzero(directions[known][used, : state.axes.point].any(axis=2)))
+    return NormalisedInnovation(
+        distances, weights, nis if used.any() else None, count, densities, shares
+    )

@@ -14,7 +14,7 @@ from slam_observer_ros.filter.flat_arrays import (
     Seen,
 )
 from slam_observer_ros.filter.landmark_table import Landmarks
-from slam_observer_ros.lie import se3
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.motion_noise import Factors, MotionFigures
 from slam_observer_ros.models.point_noise import PointFigures
@@ -112,6 +112,10 @@ def random_observation(rng):
     c, c_v = len(x.drift), len(x.estimated)
     c_s = min(len(x.drift) - c_v, int(rng.integers(8)))
     is_calibrated = bool(rng.integers(2))
+    turns = rng.standard_normal((m, 3)) * (1.0 - x.is_planar, 1.0 - x.is_planar, 1.0)
+    directions = so3.exp(turns)
+    unmeasured = rng.random((m, 3)) < 0.4
+    directions[unmeasured & ~unmeasured[:, :2].all(axis=1)[:, None]] = 0.0
     seen = Seen(
         now_ns,
         rows,
@@ -120,6 +124,7 @@ def random_observation(rng):
         np.array([random_covariance(rng, 3, rng.choice([0.0, 0.1])) for _ in rows])
         if rng.integers(2)
         else None,
+        directions if rng.integers(2) else None,
         0.01 * rng.standard_normal(7) if is_calibrated else None,
         np.sort(rng.permutation(7)[:c_s]).astype(np.int64),
         c_v,

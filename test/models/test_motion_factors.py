@@ -169,7 +169,7 @@ def test_score_and_information_are_those_of_the_likelihood():
         return -0.5 * (r.ravel() @ np.linalg.solve(S, r.ravel()) + np.linalg.slogdet(S)[1])
 
     S = np.eye(3 * m) + M.sum(axis=0)
-    g, F = gated_score(r, S, flat, N, settings.rejection_threshold)
+    g, F = gated_score(r, S, flat, N, np.full(m, 3), settings.rejection_threshold)
     for j, step in enumerate(1e-5 * np.eye(2)):
         slope = (log_likelihood(step) - log_likelihood(-step)) / 2e-5
         assert g[j] == pytest.approx(slope, rel=1e-6)

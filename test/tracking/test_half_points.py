@@ -23,7 +23,6 @@ from slam_observer_ros.filter import step as numpy_step
 from slam_observer_ros.filter.robust import straight_odds, straight_share
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
-from slam_observer_ros.models.motion_noise import MotionFactors
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.runs.health import of_estimate
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -109,11 +108,11 @@ def test_half_points_of_a_surveyed_map_say_where_the_robot_is(settings, kind):
 
 
 @pytest.mark.parametrize('settings', [SETTINGS, SPATIAL], ids=['plane', 'space'])
-def test_a_bearing_and_a_range_are_the_point_of_both(settings, monkeypatch):
-    # Half points don't show how noisy the motion is.
-    monkeypatch.setattr(MotionFactors, 'flat', lambda _: None)
+def test_a_bearing_and_a_range_are_the_point_of_both(settings):
     # Without weights, which judge a point by both of its parts together.
-    settings = replace(settings, huber_threshold=0.0, rejection_threshold=100.0)
+    settings = replace(
+        settings, huber_threshold=0.0, rejection_threshold=100.0, motion_noise_factor='stated'
+    )
     whole, halves = World(settings, seed=1), World(settings, seed=1)
     for _ in range(20):
         # The same noise: of the same numbers that are drawn.
@@ -139,6 +138,19 @@ def test_degrees_of_freedom_are_those_that_were_measured():
         innovation = world.estimator.last_update.innovation
         assert innovation.degrees_of_freedom == expected
         assert np.abs(innovation.log_densities).max() < 10.0
+
+
+def test_bearings_show_how_noisy_the_motion_is_as_points_do():
+    stated = (0.0, 0.0, 0.005)
+    settings = replace(SETTINGS, motion_noise_factor='auto', angular_velocity_noise=stated)
+    factors = []
+    for kind in (POINT, BEARING):
+        world = World(settings)
+        world.drive(40.0, [kind], rows=range(N))
+        (turning,) = (e for e in world.estimator.motion_factors if e.name == 'turning')
+        factors.append(turning.factor)
+    assert factors[1] == pytest.approx(factors[0], rel=0.1)
+    assert factors[1] == pytest.approx(4.0, rel=0.3)
 
 
 def test_a_scale_of_the_ranges_is_found():
@@ -297,8 +309,7 @@ def test_numpy_does_with_half_points_what_the_compiled_core_does(settings, known
         worlds[-1].drive(0.8 if known else 60.0, [RANGE, BEARING], rows=range(N))
     poses = [world.estimator.pose for world in worlds]
     assert set(worlds[0].estimator.landmark_ids) == set(range(N))
-    # What is not measured may be off by a kilometre, whose rounding adds up with the steps.
-    assert np.abs(poses[0] - poses[1]).max() < (1e-9 if known else 1e-7)
+    assert np.abs(poses[0] - poses[1]).max() < (1e-12 if known else 1e-7)
 
 
 @pytest.mark.parametrize('kind', [RANGE, BEARING])

@@ -10,7 +10,13 @@ import pytest
 from rounding import off_by
 
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AZIMUTH_RANGE,
+    ObservationEvent,
+    POINT,
+    RANGE,
+    VelocityEvent,
+)
 from slam_observer_ros.filter import core
 from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
 from slam_observer_ros.filter.riccati.riccati import RiccatiGains
@@ -215,6 +221,33 @@ def test_so_it_is_among_tags_with_orientations(monkeypatch, is_planar, is_large)
     joint = estimator._state.errors.joint
     assert joint.is_dense != is_large
     assert both.moved >= 50 and both.observed == 60
+
+
+@pytest.mark.parametrize('is_planar', [False, True])
+def test_so_it_is_where_some_of_what_is_seen_are_half_points(monkeypatch, is_planar):
+    both, rng = BothWays(monkeypatch), np.random.default_rng(0)
+    settings = Settings(
+        two_d_mode=is_planar, reorder_window=0.0, range_scale_stddev=0.05, bearing_noise=0.02
+    )
+    estimator = Estimator(settings, judges_innovations=True)
+    flat, V = (1.0, 1.0, 1.0 - is_planar), np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0])
+    landmarks = rng.uniform(-8.0, 8.0, (8, 3)) * flat
+    for step_number in range(OBSERVATIONS):
+        stamp_ns, pose = step_number * 10**8, se3.exp(0.1 * step_number * V)
+        estimator.add(VelocityEvent(stamp_ns, V + 0.02 * rng.standard_normal(6)))
+        lines = se3.transform(se3.inverse(pose), landmarks)
+        lines += 0.02 * rng.standard_normal((8, 3)) * flat
+        ranges_m = np.linalg.norm(lines, axis=1, keepdims=True)
+        # Until all are known, points; then any of what there is, some of it stated.
+        kinds = np.full(8, POINT) if step_number < 5 else rng.integers(0, 5, 8)
+        is_range = (kinds == RANGE)[:, None]
+        has_range = np.isin(kinds, (POINT, RANGE, AZIMUTH_RANGE))[:, None]
+        shown = np.where(is_range, ranges_m * [1.0, 0.0, 0.0], lines)
+        shown = np.where(has_range, shown, lines / ranges_m)
+        stated = np.tile(0.02**2 * np.eye(3), (8, 1, 1)) if step_number % 2 else None
+        estimator.add(ObservationEvent(stamp_ns, np.arange(8), shown, stated, kinds=kinds))
+    assert both.observed == OBSERVATIONS and both.moved >= 50
+    assert len(estimator.world_points) == 8
 
 
 @pytest.mark.parametrize('name', ['simulated loop, 3D stereo', 'simulated loop, wheeled'])
