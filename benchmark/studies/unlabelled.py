@@ -166,7 +166,6 @@ def _print_kind(kind: str, rows: Sequence[Compared]) -> None:
     sys.stdout.write(
         f'| {kind} | {len(rows)} | {np.median(ratios):.2f} | '
         f'{np.percentile(ratios, 90, method="higher"):.2f} | '
-        f''
         f'{ratios.max():.2f} | {np.mean(ratios > 1.5):.0%} | {sum(r.too_many for r in rows)} | '
         f'{sum(r.too_few for r in rows)} | {sum(not r.anees <= WRONG_ANEES for r in rows)} | '
         f'{len(wrong)} | {sum(not r.says_so for r in wrong)} | '
@@ -250,7 +249,7 @@ def run(world: World) -> Outcome:
                 estimator.world_points,
                 true_pose[0],
                 world.landmarks_at(event.stamp_ns),
-                None if count % NEES_EVERY else estimator.configuration_covariance,
+                None if error.nees and count % NEES_EVERY else estimator.configuration_covariance,
                 update.ids[~update.rejected],
             )
         start_s = time.process_time()

@@ -113,6 +113,7 @@ class LandmarkTable(LandmarkColumns):
                 'passed',
                 'missed',
                 'born_ns',
+                'was_sure',
             ),
             (np.int64, ()),
         ),
@@ -137,6 +138,7 @@ class LandmarkTable(LandmarkColumns):
     passed: IntArray
     # (n,) stamp at which each was seen for the first time; −1 for one that a map had
     born_ns: IntArray
+    was_sure: IntArray  # (n,) 1 where it was counted as one that surely exists, else 0
     # (n, 3) its position at the first and the last of the rejections, metres, reference frame
     rejected_at: FloatArray
     rejected_last: FloatArray
@@ -272,10 +274,12 @@ class LandmarkTable(LandmarkColumns):
         return np.asarray(1.0 / (1.0 + np.exp(-self.evidence[rows] - self.prior)))
 
     def weigh(self, rows: IntArray, evidence: FloatArray) -> int:
-        """Count evidence (m,) that ``rows`` exist; return how many surely do since then."""
+        """Count evidence (m,) that ``rows`` exist; return how many surely do from now on."""
         before, after = self.evidence[rows], self.evidence[rows] + evidence
         self.evidence[rows] = np.where(before < np.inf, np.minimum(after, MOST_EVIDENCE), before)
-        now = rows[(before + self.prior < SURE) & (after + self.prior >= SURE)]
+        is_sure = (after + self.prior >= SURE) & (before < np.inf)
+        now = rows[is_sure & (self.was_sure[rows] == 0)]
+        self.was_sure[now] = 1
         self._confirmed_in_view += int(np.sum(self.in_view[now]))
         self._confirmed_seen += int(np.sum(self.counts[now]))
         return len(now)
@@ -318,7 +322,7 @@ class LandmarkTable(LandmarkColumns):
         self.counts[rows] = 1
         self.rejections[rows] = 0
         self.evidence[rows] = np.where(is_automatic(self.ids[rows]), 0.0, np.inf)
-        self.in_view[rows] = self.passed[rows] = self.missed[rows] = 0
+        self.in_view[rows] = self.passed[rows] = self.missed[rows] = self.was_sure[rows] = 0
 
     def merge(self, rows: IntArray, copies: IntArray) -> None:
         """Count what was seen of ``copies`` (m,), which are about to go, for ``rows`` (m,)."""

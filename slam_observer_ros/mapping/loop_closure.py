@@ -1,9 +1,7 @@
 """Landmarks without ids that turn out to be one: near each other, or at the end of a loop.
 
-After a loop the pose is so uncertain that a point may be of many landmarks, and one taken for a
-wrong one throws the map. So while enough new landmarks can decide later, points are held back
-from old ones (:mod:`slam_observer_ros.tracking.assignments`), and taken for new ones. Where
-these lie to each other as old ones do, in one way only, they are those.
+After a loop the pose may be so uncertain that points pass for new landmarks. Where these lie to
+each other as old ones do, in one way only, they are those.
 """
 
 from __future__ import annotations

@@ -18,7 +18,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.filter.landmark_table import MIN_LOOP
 from slam_observer_ros.filter.observer import Observer, Residuals
 from slam_observer_ros.filter.robust import accepted, huber_loss
 from slam_observer_ros.lie import se3
@@ -34,6 +33,7 @@ from slam_observer_ros.tracking.hypothesis import LandmarkIndex
 from slam_observer_ros.tracking.joint_compatibility import (
     columns_of,
     JointSearch,
+    NewCosts,
     Pairing,
     Pairs,
     pruning_cost,
@@ -51,11 +51,6 @@ HARDLY_MOVED = 0.5 * RESOLUTION
 the robot: then no other assignment has to be looked for.
 """
 
-UNCERTAIN = 3.0
-"""Deviation of an old landmark's prediction, over the sensor's, from which on it does not show
-which of several landmarks a point is of: such pairs are held back.
-"""
-
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
@@ -70,14 +65,14 @@ def find_assignments(
     state: State,
     index: LandmarkIndex,
     event: ObservationEvent,
-    new_costs: FloatArray,
+    new_costs: NewCosts,
     budget: float,
     is_alone: bool,
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different poses, the most likely first.
 
     ``state`` is at the instant of ``event``, an observation of m points, and ``index`` has
-    its landmarks. Points without an id cost ``new_costs`` (m,) if they are of a new landmark. None
+    its landmarks. Points without an id cost ``new_costs`` if they are of a new landmark. None
     costs more than ``budget``. Where the state ``is_alone``, costs matter only to each other.
     """
     # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
@@ -89,7 +84,7 @@ def find_assignments(
     # Which points are of a known landmark in any case: nearly always all, and each of one.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
-    none_costs = np.where(event.ids == UNKNOWN_ID, new_costs, gate_cost)
+    none_costs = np.where(event.ids == UNKNOWN_ID, new_costs.each, gate_cost)
     if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at) == m:
         evidence = 0.5 * (none_costs[at] - huber_loss(mahalanobis(r, noise)))
         return [Assignment(_taken(m, at, rows, -1), _taken(m, at, evidence, 0.0), 0.0)]
@@ -98,11 +93,19 @@ def find_assignments(
     # The cost of a point that is of no landmark.
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
     # Points outside the search; one of no landmark costs the same whatever it might have been.
-    fixed_cost = float(none_costs.sum() - unpaired_costs[np.unique(at)].sum())
+    within = np.unique(at)
+    outside, steps = m - len(within), new_costs.steps
+    fixed_cost = float(none_costs.sum() - unpaired_costs[within].sum() + steps[:outside].sum())
     margin = 0.0 if certain.all() else pruning_cost(event.ids)
     pair_costs = -2.0 * np.log(state.landmarks.existence(rows))
     search = JointSearch(
-        pairs, certain, unpaired_costs[at], margin, budget - fixed_cost, pair_costs
+        pairs,
+        certain,
+        unpaired_costs[at],
+        margin,
+        budget - fixed_cost,
+        pair_costs,
+        steps[outside:],
     )
     moves = _PoseMoves(state, seen, PC)
     # Nearly always each point may be of one landmark, and all together hardly move the robot.
@@ -179,40 +182,12 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     at, rows = at[allowed], rows[allowed]
     residuals = _as_residuals(state.observer, seen, at, rows)
     distances = state.gains.distances(residuals)
-    held_back = _are_held_back(state, seen, residuals, at, distances)
-    at, rows, distances = at[~held_back], rows[~held_back], distances[~held_back]
     # Each pair passes the gate alone; a point keeps its nearest landmarks.
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
     passes = accepted(distances[order], state.settings.rejection_threshold)
     near = order[(rank < MAX_CANDIDATES) & passes]
     return at[near], rows[near]
-
-
-def _are_held_back(
-    state: State, seen: _Points, residuals: Residuals, at: IntArray, distances: FloatArray
-) -> BoolArray:
-    """Return which pairs (q,) of a point and an old landmark are not decided yet.
-
-    The point may be of many old landmarks, and there are many new ones: how these lie will show
-    later which of the old ones they are.
-    """
-    landmarks, rows, stamp_ns = state.landmarks, residuals.rows, seen.stamp_ns
-    held_back = np.zeros(len(at), dtype=np.bool_)
-    passes = accepted(distances, state.settings.rejection_threshold)
-    rivals = np.bincount(at[passes], minlength=len(seen.points))[at] if len(at) else at
-    may_be = passes & (rivals >= MIN_LOOP) & landmarks.are_old(rows, stamp_ns)
-    if not state.is_mapping or not may_be.any():
-        return held_back
-    if np.count_nonzero(landmarks.are_new(state.confirmed, stamp_ns)) < MIN_LOOP:
-        return held_back
-    residuals = residuals.select(may_be)
-    noise = residuals.on(state.axes)[1]
-    predicted = diagonal_blocks(state.known_errors.predicted(residuals)[1], noise.shape[1])
-    held_back[may_be] = np.trace(predicted, axis1=1, axis2=2) > UNCERTAIN**2 * np.trace(
-        noise, axis1=1, axis2=2
-    )
-    return held_back
 
 
 def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:

@@ -19,7 +19,7 @@ from slam_observer_ros.lie.matrices import (
     mahalanobis,
     with_blocks,
 )
-from slam_observer_ros.tracking.joint_compatibility import joint_cost, unpaired_cost
+from slam_observer_ros.tracking.joint_compatibility import joint_cost, NewCosts, unpaired_cost
 from slam_observer_ros.tracking.matching import (
     MatchedObservation,
     rejected_before,
@@ -105,26 +105,37 @@ more.
 class NewLandmarks:
     """What it costs to take a point for a new landmark or a false point; −2 ln of a likelihood.
 
-    Such points are anywhere in the volume in which the sensor sees. On new ground they are many.
-    Where all is known a point that could only just be of a known landmark hardly ever is another.
+    Such points are anywhere in the volume in which the sensor sees. Where all is known a point
+    that could only just be of a known landmark hardly ever is another. On new ground they are
+    many: where one point is new others are, too.
     """
 
     def __init__(self) -> None:
         self._observations = self._points = self._new = 0.0  # of late
         self._stamp_ns: int | None = None
 
-    def costs(self, noise: FloatArray, volume: float, most: float) -> FloatArray:
-        """Return the cost (m,) of each point, which has ``noise`` (m, k, k), m².
+    def costs(self, noise: FloatArray, volume: float, most: float) -> NewCosts:
+        """Return the costs of points (m,), which have ``noise`` (m, k, k), m².
 
-        It is −2 ln λ √|2π R|, λ being how many there are in an observation and a unit of
-        ``volume``, m^k, of what the sensor sees; and ``most`` where that is not known.
+        Of each it is −2 ln λ √|2π R|, λ being how many there are in an observation and a unit of
+        ``volume``, m^k, of what the sensor sees; and ``most`` where that is not known. With s the
+        share of points that are new, u of m are with a likelihood of sᵘ (1 − s)ᵐ⁻ᵘ where they come
+        one by one. With a probability of s the robot has come to new ground, where any share of
+        them may be: 1 / ((m + 1) (m over u)).
         """
+        m = len(noise)
         if not volume:
-            return np.full(len(noise), most)
+            return NewCosts(np.full(m, most), np.zeros(m))
         share = (self._new + SHARE_AT_FIRST * POINTS_AT_FIRST) / (self._points + POINTS_AT_FIRST)
         density = share * max(self._points / max(self._observations, 1.0), 1.0) / volume
         costs = -2.0 * math.log(density) - np.linalg.slogdet(2.0 * math.pi * noise)[1]
-        return np.asarray(np.clip(costs, min(LEAST_COST, most), most))
+        s, u = min(share, 0.5), np.arange(m + 1)
+        one_by_one = math.log1p(-s) + u * math.log(s) + (m - u) * math.log1p(-s)
+        ln_choices = np.append(0.0, np.cumsum(np.log((m - u[:-1]) / (u[:-1] + 1.0))))
+        on_new_ground = math.log(s / (m + 1)) - ln_choices
+        steps = -2.0 * (np.diff(np.logaddexp(one_by_one, on_new_ground)) - math.log(s))
+        each = np.clip(costs, min(LEAST_COST, most), most)
+        return NewCosts(each, np.minimum(steps, 0.0))
 
     def note(self, event: ObservationEvent, new: int) -> None:
         """Count an observation, and how many landmarks turned out to be ``new``, or false."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import takewhile
 import math
 
 import numpy as np
@@ -34,7 +35,7 @@ from slam_observer_ros.models.velocity_delay import DelayEvidence
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.tracking.costs import NewLandmarks
 from slam_observer_ros.tracking.covariances import of_pose
-from slam_observer_ros.tracking.hypothesis import Hypothesis, Twins
+from slam_observer_ros.tracking.hypothesis import Branch, Hypothesis, Twins
 from slam_observer_ros.tracking.interpretations import (
     Interpretation,
     interpretations,
@@ -43,6 +44,7 @@ from slam_observer_ros.tracking.interpretations import (
 from slam_observer_ros.tracking.joint_compatibility import (
     PRUNING_COST,
     pruning_cost,
+    PRUNING_COST_OF_IDS,
     RESOLUTION,
     unpaired_cost,
 )
@@ -61,12 +63,19 @@ AMBIGUOUS_NS = 5_000_000_000
 LEAST_DEVIATION = 0.01
 """Deviation of a pose, rad and m, within which poses are the same."""
 
+OVERTHROWN = 4.0
+"""Normalised square, per axis, of how far a map was off from which on it was wrong: 2 σ in all."""
+
+COMPARED = 16
+"""Landmarks by which two maps are compared, those seen last: time grows with their cube."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Child:
     """A hypothesis after an observation, the meaning that it took it in, and what that did."""
 
     hypothesis: Hypothesis
+    parent: int  # number of the hypothesis that it was before
     event: ObservationEvent
     update: Update
 
@@ -166,6 +175,7 @@ class Hypotheses:
                     hypothesis.apart = apart
                 elif other is not None:
                     other.apart, other.cost = apart, other.cost + 2.0 * twins.log_odds
+                    _part((hypothesis, other), int(state.landmarks.last_seen_ns.max()))
                     self._all.append(other)
         self._all = sorted(self._all, key=lambda one: one.cost)[: self._limit]
 
@@ -345,6 +355,18 @@ class Hypotheses:
         if self._longest is None or present.lasts_ns > self._longest.lasts_ns:
             self._longest = present
 
+    def _note_overthrow(self, shown: Hypothesis, path: Sequence[Branch], stamp_ns: int) -> None:
+        """Note since when a map was wrong that was shown, and is not the most likely one now."""
+        best = self._all[0]
+        ways = zip(path, best.path, strict=False)
+        since = next((old for old, new in ways if old.number != new.number), None)
+        if since is None or _off(best.state, shown.state) <= OVERTHROWN:
+            return
+        probability = 1.0 / (1.0 + math.exp(0.5 * min(max(shown.cost, 0.0), PRUNING_COST_OF_IDS)))
+        wrong = Ambiguity(since.stamp_ns, stamp_ns, since.position, probability)
+        if self._longest is None or wrong.lasts_ns > self._longest.lasts_ns:
+            self._longest = wrong
+
     def _disagreement(self) -> float:
         """Return the pose's deviation by all hypotheses over that by the best one, at most."""
         of_each: list[tuple[FloatArray, FloatArray | None]] = []
@@ -399,11 +421,19 @@ class Hypotheses:
         number, likeliest = possible[0]
         if self._views is not None and not number and likeliest.slipped is None:
             self._views.add(self.best, likeliest.event)
-        children = self._follow(event, possible)
+        shown, children = self._all[0], self._follow(event, possible)
         least_cost = children[0].hypothesis.cost
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
+        if unknown and children[0].parent:
+            still = (child.hypothesis for child in children if not child.parent)
+            self._note_overthrow(next(still, shown), shown.path, event.stamp_ns)
+        # A way that all of them went sets none of them apart.
+        paths = [hypothesis.path for hypothesis in self._all]
+        if common := len(_common(paths)):
+            for hypothesis in self._all:
+                hypothesis.path = hypothesis.path[common:]
         if unknown:
             visibility = self._all[0].visibility
             self._new_landmarks.note(event, visibility.sure_now + visibility.false_now)
@@ -425,15 +455,19 @@ class Hypotheses:
                 if uses[number]:
                     hypothesis = hypothesis.copy()
             # Of hypotheses that become one, the first stands for all.
-            child = self._child(hypothesis, taken, event)
+            child = self._child(hypothesis, number, taken, event)
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
             if len(children) == self._limit:
                 break
+        for number, count in Counter(child.parent for child in children).items():
+            if count > 1:
+                same = (child.hypothesis for child in children if child.parent == number)
+                _part(same, event.stamp_ns)
         return sorted(children, key=lambda child: child.hypothesis.cost)
 
     def _child(
-        self, hypothesis: Hypothesis, taken: Interpretation, event: ObservationEvent
+        self, hypothesis: Hypothesis, parent: int, taken: Interpretation, event: ObservationEvent
     ) -> _Child:
         """Let a hypothesis use an observation as one interpretation has it."""
         state = hypothesis.state
@@ -448,7 +482,7 @@ class Hypotheses:
                     rows[rows >= 0], taken.evidence[rows >= 0]
                 )
             hypothesis.cost += visibility.note(state, taken.event, self._some_have_ids)
-        return _Child(hypothesis, taken.event, update)
+        return _Child(hypothesis, parent, taken.event, update)
 
     def _interpret(self, event: ObservationEvent) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.
@@ -461,6 +495,8 @@ class Hypotheses:
         noise = self.best.observation_noise.covariances(event)[:, :k, :k]
         volume = self._all[0].visibility.field_of_view.volume
         new_costs = self._new_landmarks.costs(noise, volume, gate_cost)
+        if self._some_have_ids:  # which say more about new ground
+            new_costs = replace(new_costs, steps=np.zeros(len(noise)))
         is_alone = len(self._all) == 1
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf  # the most that is worth following, the cheapest so far being known
@@ -481,6 +517,37 @@ class Hypotheses:
             ids = hypothesis.state.landmarks.ids
             self._next_id = max(self._next_id, int(np.max(ids[is_automatic(ids)], initial=0)) + 1)
         return self._next_id + np.arange(m)
+
+
+def _part(hypotheses: Iterable[Hypothesis], stamp_ns: int) -> None:
+    """Note that each goes another way than the others from now on."""
+    for number, hypothesis in enumerate(hypotheses):
+        position = hypothesis.state.observer.pose[:3, 3].copy()
+        hypothesis.path = (*hypothesis.path, Branch(number, stamp_ns, position))
+
+
+def _common(paths: Sequence[Sequence[Branch]]) -> list[Branch]:
+    """Return the ways that all paths begin with."""
+    steps = zip(*paths, strict=False)
+    same = takewhile(lambda each: len({(one.stamp_ns, one.number) for one in each}) == 1, steps)
+    return [each[0] for each in same]
+
+
+def _off(state: State, other: State) -> float:
+    """Return the normalised square, per axis, of how far a state has the landmarks of another.
+
+    As the robot sees those seen last, by how well the other one knows where they are.
+    """
+    rows = other.confirmed
+    rows = rows[np.argsort(-other.landmarks.last_seen_ns[rows], kind='stable')]
+    own = state.landmarks.rows_of(other.landmarks.ids[rows])
+    rows, own = rows[own >= 0][:COMPARED], own[own >= 0][:COMPARED]
+    covariance, k = other.configuration_covariance(rows), other.axes.point
+    if covariance is None or not len(rows):
+        return 0.0
+    d = (state.observer.body_points(own) - other.observer.body_points(rows))[:, :k].ravel()
+    z = np.linalg.solve(cholesky(covariance + LEAST_DEVIATION**2 * np.eye(len(d))), d)
+    return float(z @ z / len(z))
 
 
 def _lasting(ambiguity: Ambiguity | None) -> Ambiguity | None:

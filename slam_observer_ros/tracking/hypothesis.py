@@ -7,7 +7,7 @@ and a record of the sensor's view: which landmarks should have been seen, and wh
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
@@ -245,6 +245,15 @@ class Twins:
     log_odds: float  # that they are one
 
 
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """Where a hypothesis parted from another one that is followed."""
+
+    number: int  # which of the two it is
+    stamp_ns: int
+    position: FloatArray  # (3,) of the robot, metres, world
+
+
 @dataclass(slots=True, eq=False)
 class Hypothesis:
     """A state, with the helpers for points without an id."""
@@ -254,6 +263,7 @@ class Hypothesis:
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
     cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
     apart: frozenset[tuple[int, int]] = frozenset()  # ids that are two landmarks in any case
+    path: tuple[Branch, ...] = ()  # which way it went where others went another
 
     @classmethod
     def of(cls, state: State) -> Hypothesis:
@@ -262,7 +272,8 @@ class Hypothesis:
 
     def with_state(self, state: State) -> Hypothesis:
         """Return another hypothesis, which has had the same landmarks in view."""
-        return Hypothesis(state, self.visibility.copy(), copy(self.index), self.cost, self.apart)
+        visibility, index = self.visibility.copy(), copy(self.index)
+        return replace(self, state=state, visibility=visibility, index=index)
 
     def copy(self) -> Hypothesis:
         """Return an independent copy."""

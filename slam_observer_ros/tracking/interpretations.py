@@ -21,6 +21,7 @@ from slam_observer_ros.tracking.costs import (
     SLIP_COST,
 )
 from slam_observer_ros.tracking.hypothesis import LandmarkIndex
+from slam_observer_ros.tracking.joint_compatibility import NewCosts
 from slam_observer_ros.tracking.matching import (
     calibrated,
     is_contradiction,
@@ -54,14 +55,14 @@ def interpretations(
     index: LandmarkIndex,
     event: ObservationEvent,
     new_ids: IntArray,
-    new_costs: FloatArray,
+    new_costs: NewCosts,
     budget: float,
     is_alone: bool = False,
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
     ``state`` is at its instant, ``index`` has its landmarks. Points taken for landmarks not seen
-    before get ``new_ids`` (m,), at costs ``new_costs`` (m,) for those without an id.
+    before get ``new_ids`` (m,), at ``new_costs`` for those without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """
@@ -131,12 +132,12 @@ def _slips_without_ids(
     index: LandmarkIndex,
     event: ObservationEvent,
     new_ids: IntArray,
-    new_costs: FloatArray,
+    new_costs: NewCosts,
     found: list[Assignment],
 ) -> list[Interpretation]:
     """Take the robot for slipped, where more points are new than a slip is unlikely."""
     new = min((int(np.sum(one.rows < 0)) for one in found), default=len(event.ids))
-    cost = min((float(new_costs[one.rows < 0].sum()) for one in found), default=np.inf)
+    cost = min((new_costs.of(one.rows < 0) for one in found), default=np.inf)
     if cost <= SLIP_COST or not len(state.landmarks):
         return []
     slips: dict[bytes, Interpretation] = {}
@@ -148,7 +149,7 @@ def _slips_without_ids(
             taken = _with_ids(state, event, assignment, new_ids).event
             slipped = _after_slip(state, match(state, taken), taken)
             if slipped is not None:
-                spared = float(np.sum(outlier_cost(state) - new_costs[is_new]))
+                spared = np.count_nonzero(is_new) * outlier_cost(state) - new_costs.of(is_new)
                 evidence, cost = assignment.evidence, slipped.cost - spared
                 slips[taken_for] = replace(slipped, cost=cost, evidence=evidence)
     return list(slips.values())

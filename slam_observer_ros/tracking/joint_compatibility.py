@@ -55,6 +55,18 @@ class Pairs:
     noise: FloatArray  # (q, k, k) the part R of it that is the sensor's noise
 
 
+@dataclass(frozen=True, slots=True)
+class NewCosts:
+    """What it costs to take points of one observation for new landmarks or false points."""
+
+    each: FloatArray  # (m,) of each, as if it were the only one
+    steps: FloatArray  # (m,) what the first of them costs more for that, the second, … ≤ 0
+
+    def of(self, is_new: BoolArray) -> float:
+        """Return what some of the points cost together: ``is_new`` (m,) says which."""
+        return float(self.each[is_new].sum() + self.steps[: np.count_nonzero(is_new)].sum())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairing:
     """Some of the pairs, none with a point or landmark of another."""
@@ -92,8 +104,9 @@ class JointSearch:
 
     ``certain`` (q,) are the pairs whose point is of some known landmark in any case,
     ``unpaired_costs`` (q,) what the pair's point costs if it is of none, and ``pair_costs`` (q,)
-    what pairs cost more whose landmark may not exist. A pairing may cost
-    ``margin`` more than the cheapest, and ``budget`` in all.
+    what pairs cost more whose landmark may not exist. Of points that are of none the first, second
+    … costs ``steps`` more. A pairing may cost ``margin`` more than the cheapest, and ``budget`` in
+    all.
     """
 
     def __init__(
@@ -104,6 +117,7 @@ class JointSearch:
         margin: float,
         budget: float = math.inf,
         pair_costs: FloatArray | float = 0.0,
+        steps: FloatArray | None = None,
     ) -> None:
         self._pairs = pairs
         self._certain = certain
@@ -113,6 +127,8 @@ class JointSearch:
         # Points with the fewest options first: they are the surest, and the others follow them.
         order = points[np.argsort(counts, kind='stable')]
         self._options = [np.flatnonzero(pairs.points == point) for point in order]
+        # What the first point of no landmark costs less for that, the second one, ….
+        self._steps = np.zeros(len(points)) if steps is None else steps
         # (q,) what the rise of the cost with a pair is less by
         self._less = np.linalg.slogdet(pairs.noise)[1] - pair_costs
 
@@ -136,13 +152,13 @@ class JointSearch:
     def pairings(self) -> list[Pairing]:
         """Return the pairings, the cheapest first; points without a landmark are in no pair."""
         partial = [Pairing(0.0, [], np.empty((0, 0)), np.empty(0))]
-        for options in self._options:  # the pairs of one more point
+        for done, options in enumerate(self._options):  # the pairs of one more point
             # Pairings of one size are extended together.
             sizes = dict.fromkeys(len(pairing.chosen) for pairing in partial)
             groups = [
                 [pairing for pairing in partial if len(pairing.chosen) == size] for size in sizes
             ]
-            partial = self._cheapest([self._extensions(group, options) for group in groups])
+            partial = self._cheapest([self._extensions(group, options, done) for group in groups])
         return partial
 
     def _cheapest(self, extensions: list[_Extensions]) -> list[Pairing]:
@@ -163,8 +179,11 @@ class JointSearch:
             pairings.append(extensions[group].extended(i, j))
         return pairings
 
-    def _extensions(self, pairings: list[Pairing], options: IntArray) -> _Extensions:
-        """Return how pairings (b,) of one size may go on with the pairs ``options`` (o,)."""
+    def _extensions(self, pairings: list[Pairing], options: IntArray, done: int) -> _Extensions:
+        """Return how pairings (b,) of one size may go on with the pairs ``options`` (o,).
+
+        They are of the first ``done`` points.
+        """
         S, r, k = self._pairs.covariances, self._pairs.residuals, self._pairs.residuals.shape[1]
         L = np.array([pairing.L for pairing in pairings])
         z = np.array([pairing.z for pairing in pairings])
@@ -182,7 +201,9 @@ class JointSearch:
         rises[self._are_taken(pairings, options)] = np.inf
         rises -= self._less[options]
         is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
-        without = np.where(is_certain, np.inf, self._unpaired_costs[options[0]])
+        unpaired = done - len(pairings[0].chosen)
+        cost = self._unpaired_costs[options[0]] + self._steps[unpaired]
+        without = np.where(is_certain, np.inf, cost)
         before = np.array([[pairing.cost] for pairing in pairings])
         costs = before + np.column_stack([rises, without])
         rows = np.concatenate([-corners @ transpose(W) @ L[:, None], corners], axis=3)

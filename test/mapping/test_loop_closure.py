@@ -10,14 +10,11 @@ import pytest
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import make_gains
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking.assignments import find_assignments
 from slam_observer_ros.tracking.hypotheses import Hypotheses
-from slam_observer_ros.tracking.hypothesis import LandmarkIndex
 from slam_observer_ros.tracking.joint_compatibility import PRUNING_COST
 from slam_observer_ros.tracking.state import State
 
@@ -94,19 +91,6 @@ def test_no_loop_closes_on_landmarks_that_are_others(seed):
 def test_it_takes_five_to_close_a_loop(seen):
     state, _ = after_a_loop(points_in_a_hall(1), np.arange(seen))
     assert LoopClosure().close(state, LOOP_NS + 10**9) == (seen >= 5)
-
-
-@pytest.mark.parametrize('new', [4, 6])
-def test_points_are_held_back_from_many_old_landmarks_while_new_ones_can_decide_later(new):
-    points = points_in_a_hall(2)
-    state, true_pose = after_a_loop(points, np.arange(new))
-    body = se3.transform(se3.inverse(true_pose), points[10:14])
-    event = ObservationEvent(LOOP_NS + 10**8, np.full(4, UNKNOWN_ID), body)
-    found = find_assignments(
-        state, LandmarkIndex(), event, np.full(4, 20.0), np.inf, is_alone=True
-    )
-    taken = {row for assignment in found for row in assignment.rows.tolist()}
-    assert (max(taken & set(range(16)), default=-1) < 0) == (new >= 5)
 
 
 def twins(apart_m):

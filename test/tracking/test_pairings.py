@@ -23,6 +23,7 @@ from slam_observer_ros.tracking.joint_compatibility import (
     joint_cost,
     JointSearch,
     MAX_PARTIAL,
+    NewCosts,
     Pairs,
 )
 
@@ -119,7 +120,8 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         state, index = estimator._hypotheses.best, LandmarkIndex()
-        (only,) = interpretations(state, index, event, np.arange(3), np.full(3, 20.0), np.inf)
+        new_costs = NewCosts(np.full(3, 20.0), np.zeros(3))
+        (only,) = interpretations(state, index, event, np.arange(3), new_costs, np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
@@ -147,11 +149,22 @@ def test_on_new_ground_a_new_landmark_costs_less_and_where_all_is_known_as_much_
     for second in range(100):
         new.note(replace(event, stamp_ns=second * 10**9), new=1)
     expected = -2.0 * np.log(2.0 * np.pi * 0.01 / 50.0)
-    assert new.costs(noise, 50.0, gate_cost) == pytest.approx(expected, abs=0.1)
+    assert new.costs(noise, 50.0, gate_cost).each == pytest.approx(expected, abs=0.1)
     finer = new.costs(0.25 * noise, 50.0, gate_cost)
-    assert finer == pytest.approx(expected + 2.0 * np.log(4.0), abs=0.1)
-    assert new.costs(noise, 0.0, gate_cost) == gate_cost, 'nobody knows what the sensor sees'
+    assert finer.each == pytest.approx(expected + 2.0 * np.log(4.0), abs=0.1)
+    assert new.costs(noise, 0.0, gate_cost).each == gate_cost, 'nobody knows what the sensor sees'
     for second in range(100, 600):
         new.note(replace(event, stamp_ns=second * 10**9), new=0)
-    assert new.costs(noise, 50.0, gate_cost) == gate_cost
-    assert new.costs(noise, 50.0, 4.0) == 4.0, 'no more than a point at the gate'
+    assert new.costs(noise, 50.0, gate_cost).each == gate_cost
+    assert new.costs(noise, 50.0, 4.0).each == 4.0, 'no more than a point at the gate'
+
+
+def test_where_some_points_are_new_it_is_less_unlikely_that_others_are():
+    """A robot that comes to new ground sees much that is new, and elsewhere nearly nothing."""
+    new, noise = NewLandmarks(), np.tile(0.01 * np.eye(2), (5, 1, 1))
+    costs, alone = new.costs(noise, 50.0, 40.0), np.eye(5, dtype=bool)
+    assert costs.of(alone[0]) == pytest.approx(costs.each[0], abs=0.2)
+    for count in range(2, 6):
+        some = alone[:count].any(axis=0)
+        assert costs.of(some) < count * costs.each[0] - 0.5
+        assert costs.of(some) > costs.of(alone[: count - 1].any(axis=0))

@@ -18,6 +18,7 @@ from slam_observer_ros.filter.landmark_table import (
     LandmarkTable,
     LEAST_COUNT,
     MOST_EVIDENCE,
+    SURE,
     TOO_SELDOM,
 )
 from slam_observer_ros.tracking.hypothesis import FieldOfView, Visibility
@@ -100,6 +101,15 @@ def test_a_landmark_enters_the_map_once_it_surely_exists_and_stays_while_it_may_
     miss(landmarks, 1, 200)
     assert landmarks.tentative.tolist() == [False, False]
     assert landmarks.unlikely().tolist() == []
+
+
+def test_each_landmark_counts_as_new_once_also_where_nothing_was_ever_false():
+    """Else it costs ever more to take a point for a new one."""
+    landmarks, row = table([3] * 50), np.array([1])
+    landmarks.evidence[2:] = MOST_EVIDENCE
+    assert landmarks.unlikely().tolist() == []
+    assert landmarks.prior > SURE
+    assert [landmarks.weigh(row, np.zeros(1)) for _ in range(3)] == [1, 0, 0]
 
 
 def test_where_many_points_are_false_a_new_one_is_sooner_forgotten():
