@@ -108,7 +108,7 @@ class Estimate:
     @property
     def localisation_problem(self) -> Finding | None:
         """Why the pose in a loaded map is not known; None if it is."""
-        return self._localiser.problem(self._state.observer.A)
+        return self._localiser.problem(self._state)
 
     @property
     def ids_at_two_places(self) -> list[Finding]:

@@ -127,7 +127,10 @@ class Finder:
         return self._maps[place.map_index].loaded, pairs
 
     def compare_ids(self, state: State) -> None:
-        """See whether a map has the ids but other places, or the places but other ids."""
+        """See whether a map has the ids but other places, or the places but other ids.
+
+        Only who is asked why the pose is not known does so: it may take two seconds.
+        """
         landmarks, fewest = state.landmarks, FEWEST_COMPARED + state.axes.point
         rows = np.flatnonzero(~is_automatic(landmarks.ids) & (landmarks.counts >= MIN_COUNT))
         views = int(landmarks.counts[rows].sum()).bit_length()

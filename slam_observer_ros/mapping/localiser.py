@@ -232,7 +232,7 @@ class Localiser:
             logger.info('Found the pose in the map by %d half points.', len(window.views))
         elif (finder.rivals or finder.in_a_line) and not self._said_problem:
             self._said_problem = True
-            logger.warning('%s', self.problem(state.observer.A))
+            logger.warning('%s', self.problem(state))
         return fix
 
     @property
@@ -247,10 +247,12 @@ class Localiser:
         finder = self._finder
         return [] if finder is None or finder.places is None else finder.places.likely
 
-    def problem(self, A: FloatArray) -> Finding | None:
-        """Return why the pose in the map is not known, by Â (4, 4); None if it is."""
+    def problem(self, state: State) -> Finding | None:
+        """Return why the pose in the map is not known; None if it is."""
         if self.is_localised:
             return None
+        if self._finder is not None:
+            self._finder.compare_ids(state)
         if (finder := self._half_finder) is not None and finder.in_a_line:
             ids = ', '.join(str(landmark_id) for landmark_id in finder.in_a_line)
             return found('anchors_in_a_line', ids=ids)
@@ -268,7 +270,7 @@ class Localiser:
         looks = AlikeMaps([], likeness_by_ids) if self._finder is None else self._finder.alike
         if alike := self._alike.among(maps) or looks.among(maps):
             return alike
-        fits = ' and '.join(self._name(place, A) for place in places[:MAX_NAMED])
+        fits = ' and '.join(self._name(place, state.observer.A) for place in places[:MAX_NAMED])
         if len(places) > MAX_NAMED:
             fits += f' and {len(places) - MAX_NAMED} more'
         elif len(places) == 1:
@@ -298,11 +300,9 @@ class Localiser:
             )
         elif not self._said_problem and len(self.likely_places) > 1:
             self._said_problem = True
-            finding = self.problem(state.observer.A)
+            finding = self.problem(state)
             if finding is not None and finding.kind == 'ambiguous_place':  # others are known
                 logger.warning('%s', finding)
-        else:
-            self._finder.compare_ids(state)
 
     def enter(self, state: State) -> bool:
         """Move an estimate into the frame of a loaded map, if landmarks with ids suffice."""
