@@ -128,8 +128,8 @@ class Placement:
             localiser.try_tag(by_tag.tag_id)
         elif (fix := localiser.pose_by_half_points(hypotheses.best, window)) is not None:
             lost = hypotheses.best
-            self.start(fix.pose, fix.covariance, fix.known)
-            take_scales(hypotheses.best, lost, fix.scales)
+            self.start(fix.pose, fix.covariance[:6, :6], fix.known)
+            take_scales(hypotheses.best, lost, fix.scales, fix.covariance)
 
     def start(
         self,

@@ -266,12 +266,12 @@ class JointCovariance:
     ) -> None:
         """Take over orientations (m,) seen for the first time: ω_i = φ_i + noise (m, q, q)."""
         C = np.tile(self.chart.turn_output(D), (len(rows), 1))
-        self._set(self._turn_columns(rows), C, block_diagonal(covariances))
+        self.relate(self._turn_columns(rows), C, block_diagonal(covariances))
 
     def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
         """Take over orientations (m,) whose errors (m, q, q) are independent of all else."""
         columns = self._turn_columns(rows)
-        self._set(columns, np.zeros((len(columns), self._p)), block_diagonal(covariances))
+        self.relate(columns, np.zeros((len(columns), self._p)), block_diagonal(covariances))
 
     def copy_turns(self, source: IntArray, target: IntArray) -> None:
         """Let tags ``target`` (m,) have the orientations, with their errors, of others."""
@@ -307,13 +307,13 @@ class JointCovariance:
 
     def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
         # ξ_i = C_i (ε, c̃) + noise of this covariance (m k, m k); of all else nothing is known.
-        self._set(self._columns(rows), C.reshape(-1, C.shape[2]), noise)
+        self.relate(self._columns(rows), C.reshape(-1, C.shape[2]), noise)
         if len(self._unknown):
             others = np.append(self._turn_columns(rows), self.chart.velocities(rows))
             unknown = np.tile(self._unknown, len(rows))
-            self._set(others, np.zeros((len(others), self._p)), np.diag(unknown))
+            self.relate(others, np.zeros((len(others), self._p)), np.diag(unknown))
 
-    def _set(self, columns: IntArray, C: FloatArray, noise: FloatArray) -> None:
+    def relate(self, columns: IntArray, C: FloatArray, noise: FloatArray) -> None:
         """Let entries of x (r,) be C (ε, c̃) + noise of a covariance (r, r)."""
         q = C.shape[1]
         CP = C @ self.P[:q]

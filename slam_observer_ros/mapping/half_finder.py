@@ -88,7 +88,7 @@ class Fit:
     """A pose that fits the views best of all nearby."""
 
     pose: FloatArray  # (4, 4) of the body now, in the map
-    covariance: FloatArray  # (6, 6) of rotation vector and position, map axes
+    covariance: FloatArray  # (6 + s, 6 + s) of rotation vector and position, map axes, and scales
     cost: float  # −2 ln of the likelihood, but for a constant
     square: float  # χ² of the views that fit, …
     share: float  # … which are so many of all
@@ -98,7 +98,7 @@ class Fit:
     @property
     def place_sigma_m(self) -> float:
         """The largest standard deviation of where the robot is."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1]))
 
     def is_same(self, other: Fit, axes: EstimatedAxes) -> bool:
         """Return whether another pose is this one, within their errors."""
@@ -112,9 +112,9 @@ class Fix(NamedTuple):
     """Where a robot is that was lost."""
 
     pose: FloatArray  # (4, 4) in the map
-    covariance: FloatArray  # (6, 6) of rotation vector and position, map axes
+    covariance: FloatArray  # (6 + s, 6 + s) of rotation vector and position, map axes, and scales
     known: LandmarkMap
-    scales: dict[str, float]  # ln of how much longer ranges are than as calibrated, by sensor
+    scales: dict[str, float]  # ln of how much longer ranges are than as calibrated, by s sensors
 
 
 class HalfFinder:
@@ -453,9 +453,9 @@ class _Problem:
             T, s = self._moved(T, s, step[None])
         if not (np.isfinite(T).all() and np.isfinite(covariance).all()):
             return None
-        full = np.zeros((6, 6))
-        full[axes.pose, axes.pose] = covariance[:p, :p]
-        turn = np.kron(np.eye(2), T[0, :3, :3])
+        full, turn = np.zeros((6 + s.shape[1],) * 2), np.eye(6 + s.shape[1])
+        full[np.ix_(columns, columns)] = covariance
+        turn[:6, :6] = np.kron(np.eye(2), T[0, :3, :3])
         share = float(np.mean(weights > 0.5))
         return Fit(T[0], turn @ full @ turn.T, cost, square, share, self._degrees, s[0])
 

@@ -53,13 +53,13 @@ def of_pose(observer: Observer, covariance: FloatArray, A: FloatArray) -> FloatA
 
     Of its rotation vector and its position along the world's axes, rad² and m².
     """
-    turn = _turn_to_world(observer, A)
+    turn = turn_to_world(observer, A)
     return mended(turn @ covariance @ transpose(turn))
 
 
 def of_pose_error(observer: Observer, world: FloatArray) -> FloatArray:
     """Return the covariance (6, 6) of ε from :func:`of_pose`'s, limited to MAX_POSE_ERRORS."""
-    back = np.linalg.inv(_turn_to_world(observer, observer.A))
+    back = np.linalg.inv(turn_to_world(observer, observer.A))
     covariance: FloatArray = back @ limited(world, MAX_POSE_ERRORS) @ back.T
     return covariance
 
@@ -81,7 +81,7 @@ def of_moved_pose(
     return moved
 
 
-def _turn_to_world(observer: Observer, A: FloatArray) -> FloatArray:
+def turn_to_world(observer: Observer, A: FloatArray) -> FloatArray:
     """Return the matrix (…, 6, 6) from ε to rotation and shift of the pose along world axes."""
     R = observer.reference_pose[:3, :3]
     turn = np.zeros((*A.shape[:-2], 6, 6))

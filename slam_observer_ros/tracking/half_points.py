@@ -36,6 +36,7 @@ from slam_observer_ros.lie.sensor_mounting import (
 )
 from slam_observer_ros.models.calibration import SCALE
 from slam_observer_ros.models.point_noise import point_covariances
+from slam_observer_ros.tracking.covariances import turn_to_world
 from slam_observer_ros.tracking.matching import calibrated, residuals_of
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.waiting_room import (
@@ -271,12 +272,15 @@ def _with_sensor(state: State, event: ObservationEvent) -> ObservationEvent:
     return event
 
 
-def take_scales(state: State, lost: State, scales: Mapping[str, float]) -> None:
+def take_scales(
+    state: State, lost: State, scales: Mapping[str, float], covariance: FloatArray
+) -> None:
     """Begin with ranges by what a search has found, beyond how a ``lost`` state has them.
 
-    ``scales`` are ln of how much longer, by sensor. That is a better value, of errors as stated.
+    ``scales`` are ln of how much longer, by s sensors, and ``covariance`` (6 + s, 6 + s) is the
+    pose's, in the world, and theirs: they have been found together.
     """
-    calibration = state.calibration
+    calibration, entries = state.calibration, []
     if SCALE not in calibration.of_sensor:
         return
     for frame, scale in scales.items():
@@ -288,6 +292,14 @@ def take_scales(state: State, lost: State, scales: Mapping[str, float]) -> None:
         )
         calibration.shift(change)
         state.relinearisation.add_calibration()
+        (own,) = np.flatnonzero(calibration.of_sensor == SCALE).tolist()
+        entries.append(calibration.columns(frame).start + own)
+    # Their errors are G times the pose's, and others.
+    pose, observer = state.axes.pose, state.observer
+    with_pose, to_world = covariance[6:, pose], turn_to_world(observer, observer.A)[pose, pose]
+    G = np.linalg.solve(covariance[pose, pose], with_pose.T).T
+    others = covariance[6:, 6:] - G @ with_pose.T
+    state.known_errors.joint.relate(state.axes.p + np.array(entries), G @ to_world, others)
 
 
 def _completed(

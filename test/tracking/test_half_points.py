@@ -347,3 +347,5 @@ def test_a_lost_robot_that_is_found_has_the_scale_of_its_ranges_from_the_search(
         assert world.stamp_ns < 60e9
     (scale,) = (e for e in world.estimator.calibration if e.name == 'range_scale')
     assert scale.value == pytest.approx(1.07, abs=0.02)
+    # It is as sure as the search has found it, not as it was stated before.
+    assert scale.deviation < 0.02 and abs(scale.value - 1.07) < 3.0 * scale.deviation
