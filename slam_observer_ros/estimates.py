@@ -78,7 +78,7 @@ class Change(_Counted):
     FOUND = 'new_landmark', 'new in the map'
     MOVED = 'moved_landmark', 'moved: it is where it was seen now'
     MERGED = 'merged_landmark', 'merged with another landmark, which it is'
-    FORGOTTEN = 'forgotten_landmark', 'forgotten to make room (max_landmarks)'
+    FORGOTTEN = 'forgotten_landmark', 'forgotten to make room (max_landmarks), or after a flood'
     UNSUPPORTED = 'unsupported_landmark', 'forgotten: hardly exists, by what was seen and missed'
     CARRIED = 'carried_landmark', 'moves with the robot'
 

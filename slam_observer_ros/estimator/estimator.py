@@ -14,7 +14,7 @@ from slam_observer_ros.common.errors import InvalidEventError, ParameterError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import Reason, Update
+from slam_observer_ros.estimates import Change, Reason, Update
 from slam_observer_ros.estimator.checks import (
     are_finite,
     check_event,
@@ -47,6 +47,12 @@ logger = logging.getLogger(__name__)
 
 DIVERGED_M = 1e9
 """Distance from the start, metres, that no estimate has."""
+
+FLOODED_NS = to_ns(5.0)
+"""How long after a flood of points landmarks are forgotten that it has brought in, nanoseconds.
+
+Those that were seen for longer are places, in a hall that is full of them.
+"""
 
 
 class Estimator(Estimate):
@@ -87,6 +93,8 @@ class Estimator(Estimate):
         self._on_update, self._on_stamps = on_update, on_stamps
         self._on_motion, self._on_jump = on_motion, on_jump
         self._loop_closure = LoopClosure()
+        # The first and last stamp of messages with more points than are used.
+        self._flood: tuple[int, int] | None = None
         self.reset(initial_pose)
         self._warnings.unused_settings(settings, self._state.gains)
 
@@ -341,6 +349,8 @@ class Estimator(Estimate):
         usable = usable_points(
             event, self.settings, state.gains, state.landmarks, self._counts, warnings
         )
+        if self._flood is not None or len(event.ids) > self.settings.max_points:
+            self._forget_flood(event, usable)
         event = self._timeline.synchronise(usable)
         if event.kinds is not None:
             is_lost = not self._localiser.is_localised
@@ -362,6 +372,23 @@ class Estimator(Estimate):
         self.last_update = update
         if self._on_update is not None:
             self._on_update(update)
+
+    def _forget_flood(self, event: ObservationEvent, usable: ObservationEvent) -> None:
+        """Forget what a flood of points has brought into the map, some time after its end.
+
+        Else each later observation would cost more, as errors of all landmarks are known together.
+        """
+        if len(event.ids) > self.settings.max_points == len(usable.ids):
+            begin_ns = event.stamp_ns if self._flood is None else self._flood[0]
+            self._flood = begin_ns, event.stamp_ns
+        elif self._flood is not None and event.stamp_ns - self._flood[1] >= FLOODED_NS:
+            (begin_ns, end_ns), self._flood = self._flood, None
+            for state in self._hypotheses.states:
+                table = state.landmarks
+                is_new = (table.born_ns >= begin_ns) & (table.last_seen_ns <= end_ns)
+                is_brief = table.last_seen_ns - table.born_ns < FLOODED_NS
+                rows = np.flatnonzero(is_new & is_brief)
+                state.forget(rows, Change.FORGOTTEN, event.stamp_ns)
 
     def _follow_up(self, event: ObservationEvent, update: Update) -> bool:
         """Find the pose in a map, close a loop, or start again, as an observation gives reason.
@@ -437,6 +464,7 @@ class Estimator(Estimate):
     def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""
         settings = self.settings
+        self._flood = None
         self._half_points.clear()
         self._warnings.two_places.doubt(is_all=True)
         self._queue = EventQueue(

@@ -249,6 +249,30 @@ def test_a_flood_of_points_leaves_no_more_landmarks_active_than_are_needed():
     assert len(estimator._state.known_errors.joint.active) <= 2 * (10 + 30)
 
 
+def test_landmarks_of_a_flood_are_forgotten_five_seconds_after_it_unless_seen_again():
+    estimator, m = Estimator(Settings(reorder_window=0.0, max_points=20)), 60
+    kept, again = np.arange(m) < 4, np.arange(m) < 8
+    for k in range(80):
+        event = cloud(m, np.arange(m), k * 10**8)
+        parts = {20: again, 21: again, 22: again}
+        estimator.add(event if k < 3 else event.select(parts.get(k, kept)))
+        if k == 2:
+            flooded = estimator._state.landmarks.ids.copy()
+        if k == 51:
+            assert estimator.counts['forgotten_landmark'] == 0
+    assert set(estimator._state.landmarks.ids) == set(np.flatnonzero(again))
+    assert estimator.counts['forgotten_landmark'] == np.count_nonzero(flooded >= 8)
+
+
+def test_landmarks_of_a_hall_that_is_full_of_them_stay():
+    estimator, m = Estimator(Settings(reorder_window=0.0, max_points=20)), 60
+    for k in range(120):
+        event = cloud(m, np.arange(m), k * 10**8)
+        estimator.add(event if k < 60 else event.select(np.arange(m) < 4))
+    assert estimator.counts['forgotten_landmark'] == 0
+    assert len(estimator._state.landmarks) >= 20
+
+
 def test_an_estimate_that_settings_lead_out_of_all_bounds_starts_again_and_says_so(caplog):
     estimator = Estimator(Settings(reorder_window=0.0, max_linear_velocity=1e6))
     estimator.add(ObservationEvent(0, IDS, POINTS))
