@@ -17,7 +17,7 @@ from odometry import Event, Odometry
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.filter.robust import observation_weights
+from slam_observer_ros.filter.robust import gated_weights
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.lie.matrices import block_diagonal
@@ -116,7 +116,7 @@ class EkfSlam:
         H = self._output_matrix(rows)
         HPH = H @ self._P @ H.T
         noise = covariances[:, :k, :k]
-        weights = observation_weights(z, HPH, noise, self._settings)
+        weights = gated_weights(z, HPH, noise, self._settings)
         used = weights > 0.0
         every = np.repeat(used, k)
         share = weights[used] / factors[used]

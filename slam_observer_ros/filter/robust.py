@@ -37,30 +37,22 @@ DETOURS = 0.2
 one in five, as of points without ids that are of no landmark (mapping/places.py)."""
 
 
-def observation_weights(
-    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
-) -> FloatArray:
-    """Return the weight (m,) of each observation, zero where the gate rejects it.
-
-    Other weights are Huber's. They judge R S⁻¹ r, the residual that the correction leaves, by the
-    noise R as in an M-estimator: where the state is uncertain a large residual r is no outlier.
-    """
-    k = r.shape[1]
-    passed = passing(r, with_blocks(predicted, noise), settings.rejection_threshold)
-    used = np.flatnonzero(np.repeat(passed, k))
-    weights = np.zeros(len(r))
-    weights[passed] = reweighted(
-        r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
-    )
-    return weights
+def accepted(distances: FloatArray, gate: float) -> BoolArray:
+    """Return which residuals pass the gate (``rejection_threshold``), by Mahalanobis distances."""
+    return distances <= gate
 
 
-def passing(r: FloatArray, S: FloatArray, gate: float) -> BoolArray:
-    """Return which residuals (m,) pass the gate, given their covariance S (m k, m k)."""
+def accepted_points(r: FloatArray, S: FloatArray, gate: float) -> BoolArray:
+    """Return which points pass the gate, by residuals (m, k) and their covariance S (m k, m k)."""
     # No residual is further out than all of them together are.
     if r.ravel().dot(solve_definite(S, r.ravel())) <= gate**2:
         return np.ones(len(r), dtype=np.bool_)
     return accepted(mahalanobis(r, diagonal_blocks(S, r.shape[1])), gate)
+
+
+def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return the Mahalanobis distance (m,) of each residual."""
+    return mahalanobis(r, diagonal_blocks(predicted, r.shape[1]) + noise)
 
 
 def reweighted(
@@ -77,23 +69,24 @@ def reweighted(
     return weights
 
 
-def accepted(distances: FloatArray, gate: float) -> BoolArray:
-    """Return which residuals pass the gate, by their Mahalanobis distances."""
-    return distances <= gate
+def gated_weights(
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
+) -> FloatArray:
+    """Return the weight (m,) of each orientation of a tag, zero where the gate rejects it.
 
+    The step has the same of points, a block at a time (filter/step.py).
 
-def gated(
-    r: FloatArray, predicted: FloatArray, noise: FloatArray, gate: float
-) -> tuple[BoolArray, FloatArray]:
-    """Return which observations (m,) pass the gate, and their part of ``predicted``."""
-    passed = accepted(distances(r, predicted, noise), gate)
-    used = np.flatnonzero(np.repeat(passed, r.shape[1]))
-    return passed, predicted[used][:, used]
-
-
-def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the Mahalanobis distance (m,) of each residual."""
-    return mahalanobis(r, diagonal_blocks(predicted, r.shape[1]) + noise)
+    Other weights are Huber's. They judge R S⁻¹ r, the residual that the correction leaves, by the
+    noise R as in an M-estimator: where the state is uncertain a large residual r is no outlier.
+    """
+    k = r.shape[1]
+    passed = accepted_points(r, with_blocks(predicted, noise), settings.rejection_threshold)
+    used = np.flatnonzero(np.repeat(passed, k))
+    weights = np.zeros(len(r))
+    weights[passed] = reweighted(
+        r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
+    )
+    return weights
 
 
 def straight_odds(sigmas_m: FloatArray, ranges_m: FloatArray) -> FloatArray:

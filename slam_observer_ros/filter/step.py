@@ -28,7 +28,7 @@ from slam_observer_ros.filter.flat_arrays import (
     Seen,
 )
 from slam_observer_ros.filter.landmark_table import Landmarks
-from slam_observer_ros.filter.robust import AT_ONCE, passing, reweighted
+from slam_observer_ros.filter.robust import accepted_points, AT_ONCE, reweighted
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import axes_of, EstimatedAxes
 from slam_observer_ros.lie.matrices import (
@@ -300,7 +300,7 @@ def observe(
         block = block.changed(dx) if start else block
         predicted, S = _predicted(x, block)
         r = block.flat.reshape(-1, k)
-        passed = passing(r, S, limits.gate)
+        passed = accepted_points(r, S, limits.gate)
         if limits.may_refuse and start == 0 and 2 * np.count_nonzero(passed) < len(passed):
             return REJECTS
         if factors is not None and start == 0:

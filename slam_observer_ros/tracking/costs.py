@@ -14,7 +14,7 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.observer import Residuals
-from slam_observer_ros.filter.robust import gated, huber_loss
+from slam_observer_ros.filter.robust import accepted, distances, huber_loss
 from slam_observer_ros.lie.matrices import (
     mahalanobis,
     with_blocks,
@@ -44,9 +44,10 @@ def outlier_cost(state: State) -> float:
 def pairing_cost(state: State, m: int, residuals: Residuals) -> float:
     """Return the cost of believing the ids of m points; what the gate rejects is an outlier."""
     r, noise = residuals.on(state.axes)
-    passed, predicted = gated(
-        r, state.known_errors.predicted(residuals)[1], noise, state.settings.rejection_threshold
-    )
+    predicted = state.known_errors.predicted(residuals)[1]
+    passed = accepted(distances(r, predicted, noise), state.settings.rejection_threshold)
+    used = np.flatnonzero(np.repeat(passed, r.shape[1]))
+    predicted = predicted[used][:, used]
     paired_cost = joint_cost(r[passed], with_blocks(predicted, noise[passed]), noise[passed])
     return paired_cost + (m - int(np.sum(passed))) * outlier_cost(state)
 

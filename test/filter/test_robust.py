@@ -14,8 +14,8 @@ from strategies import generators
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.filter.robust import (
+    gated_weights,
     huber_weights,
-    observation_weights,
 )
 from slam_observer_ros.lie.matrices import block_diagonal, mahalanobis
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -51,7 +51,7 @@ def test_huber_weights_are_one_within_the_threshold_and_fall_off_beyond(rng, thr
 def test_threshold_zero_is_plain_least_squares(rng):
     r, predicted, noise = random_problem(rng)
     settings = Settings(huber_threshold=0.0, rejection_threshold=1e9)
-    weights = observation_weights(100.0 * r, predicted, noise, settings)
+    weights = gated_weights(100.0 * r, predicted, noise, settings)
     np.testing.assert_array_equal(weights, 1.0)
 
 
@@ -61,7 +61,7 @@ def test_reweighted_least_squares_ends_at_hubers_estimate(rng):
     r, predicted, noise = random_problem(rng)
     r[0] *= 5.0
     settings = Settings(huber_threshold=1.345, rejection_threshold=1e9)
-    weights = observation_weights(r, 1e-3 * predicted, noise, settings)
+    weights = gated_weights(r, 1e-3 * predicted, noise, settings)
     R = block_diagonal(noise / weights[:, None, None])
     S_inv_r = np.linalg.solve(1e-3 * predicted + R, r.ravel()).reshape(r.shape)
     np.testing.assert_allclose(weights, huber_weights(S_inv_r, noise, weights, 1.345), rtol=0.05)
@@ -71,7 +71,7 @@ def test_reweighted_least_squares_ends_at_hubers_estimate(rng):
 def test_the_gate_rejects_the_one_observation_that_is_far_off(rng, outlier, k):
     r, predicted, noise = random_problem(rng, k=k)
     r[outlier] = 1e3
-    weights = observation_weights(0.1 * r, predicted, noise, Settings())
+    weights = gated_weights(0.1 * r, predicted, noise, Settings())
     assert weights[outlier] == 0.0
     assert np.all(np.delete(weights, outlier) > 0.0)
 
@@ -82,7 +82,7 @@ def test_each_observation_is_gated_by_its_own_distance(rng, scale, k):
     r, predicted, noise = random_problem(rng, k=k)
     own = np.einsum('ijik->ijk', predicted.reshape(len(r), k, len(r), k)) + noise
     distances = np.sqrt(scale**2 * np.einsum('ij,ijk,ik->i', r, np.linalg.inv(own), r))
-    weights = observation_weights(scale * r, predicted, noise, Settings(rejection_threshold=6.0))
+    weights = gated_weights(scale * r, predicted, noise, Settings(rejection_threshold=6.0))
     np.testing.assert_array_equal(weights == 0.0, distances > 6.0)
 
 

@@ -18,7 +18,7 @@ from slam_observer_ros.filter.gains import Errors, Gains, TagGains
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Residuals
-from slam_observer_ros.filter.robust import accepted, distances, observation_weights
+from slam_observer_ros.filter.robust import accepted, distances, gated_weights
 from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.matrices import mahalanobis, transpose, with_blocks
 from slam_observer_ros.models.observation_noise import RESOLUTION_RAD
@@ -76,7 +76,7 @@ class OrientationGains(Errors, Gains):
         kept = ~(are_flipped | are_unclear)
         entries = np.flatnonzero(np.repeat(kept, phi.shape[1]))
         weights = np.zeros(len(phi))
-        weights[kept] = observation_weights(
+        weights[kept] = gated_weights(
             phi[kept], predicted[np.ix_(entries, entries)], R[kept], self._settings
         )
         # K = P Hᵀ S⁻¹, X̂ ← exp(−K φ) · X̂
