@@ -1,7 +1,8 @@
 """Which mistake of the set-up explains a recording better than that it is right.
 
 Signs, units and frames: of each mistake the inverse is applied to the first minute and a half of
-driving, and the points are judged by how likely the filter found them before it used them. A
+driving, or to more if that leaves it open, and the points are judged by how likely the filter
+found them before it used them. A
 density is per unit of length: with points that are multiplied by s it is s^k times as large per
 unit of what was recorded, k being 2 in the plane and 3 in space.
 """
@@ -164,11 +165,14 @@ DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
 MOST_S = 300.0
 """Time in all, at most."""
 
+LONGER = 2.0
+"""How many times as much is looked at where less leaves it open whether a mistake was made."""
+
 
 def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
     """Return the events until the robot has driven for DRIVE_S, with points that have ids.
 
-    Or until a ``part`` of that.
+    Or until so many times, or a ``part`` of, that.
     """
     kept: list[Event] = []
     drive, first_ns = Drive(), None
@@ -262,6 +266,9 @@ T = TypeVar('T')
 SURE, CLEAR = 25.0, 0.05
 """ln of how many times likelier all points must be, and each on average."""
 
+LIKELIER = math.log(20.0)
+"""The same for all points, of a correction that more of the drive may show to be right."""
+
 STRETCH_NS, THROUGHOUT = to_ns(5.0), 0.25
 """Stretches of a drive, and the share of them that is likelier at least if a mistake explains it.
 
@@ -334,7 +341,21 @@ Steps: TypeAlias = Generator[None, None, T]
 def _named(
     settings: Settings, recorded: Iterable[Event], known: Maps | None
 ) -> Steps[list[Finding]]:
-    events = first_drive(recorded)
+    longer = first_drive(recorded, LONGER)
+    events = first_drive(longer)
+    findings = yield from _judged(settings, events, EARLY, known, len(longer) == len(events))
+    if findings is None:
+        findings = yield from _judged(settings, longer, LONGER * EARLY, known, is_all=True)
+    return findings or []
+
+
+def _judged(
+    settings: Settings, events: Sequence[Event], early: float, known: Maps | None, is_all: bool
+) -> Steps[list[Finding] | None]:
+    """Return the mistakes that explain events; None if more events, unless it is all, may do so.
+
+    By an ``early`` part of the drive is chosen what is tried on the whole.
+    """
     if not any(len(each.ids) for each in events if isinstance(each, ObservationEvent)):
         return []
     is_silent = never_turns(events)
@@ -344,10 +365,12 @@ def _named(
     singles = CORRECTIONS if known is None else IN_MAP
     if is_silent:
         singles = tuple(each for each in singles if each.turn == 1.0)
-    best = yield from _best(settings, events, before, singles, known)
+    best, is_open = yield from _best(settings, events, early, before, singles, known)
+    if is_open and not is_all:
+        return None
     if best is before:
         # As with points in millimetres and in a camera's axes, where no single one helps.
-        best = yield from _best(settings, events, before, PAIRS, known)
+        best, _ = yield from _best(settings, events, early, before, PAIRS, known)
     silent = []
     if is_silent and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
         silent = [found('no_turning')]
@@ -359,7 +382,7 @@ def _named(
             corrected, settings = list(first.apply(events)), replace(settings, **first.changes)
             before = yield from _score(settings, corrected, AS_IT_IS, known)
             others = [each for each in CORRECTIONS if first.goes_with(each)]
-            second = yield from _best(settings, corrected, before, others, known)
+            second, _ = yield from _best(settings, corrected, early, before, others, known)
             if second is not before:
                 parts = (first, second.correction)
     return silent + _findings(parts, known)
@@ -368,16 +391,18 @@ def _named(
 def _best(
     settings: Settings,
     events: Sequence[Event],
+    early: float,
     before: _Score,
     corrections: Iterable[Correction],
     known: Maps | None,
-) -> Steps[_Score]:
+) -> Steps[tuple[_Score, bool]]:
     """Return how likely points are by the correction that makes them clearly the likeliest.
 
-    That is ``before`` where none does, the score of what was recorded.
+    That is ``before`` where none does, the score of what was recorded. Then some may make them
+    likelier, though not clearly so: whether one does is returned, too.
     """
-    early, tried = first_drive(events, EARLY), []
-    at_first = before.until(early[-1].stamp_ns)
+    at_first, tried, is_open = first_drive(events, early), [], False
+    before_at_first = before.until(at_first[-1].stamp_ns)
     moves = [each.body_velocity for each in events if isinstance(each, VelocityEvent)]
     may_be = {
         'turning_in_degrees': Drive(events).turned_rad * IN_DEGREES > LEAST_TURN_RAD,
@@ -386,8 +411,8 @@ def _best(
     }
     for each in corrections:
         if may_be.get(each.kind, True):
-            score = yield from _score(settings, early, each, known, before)
-            if not score.is_hopeless and not at_first.is_clearly_better(score):
+            score = yield from _score(settings, at_first, each, known, before)
+            if not score.is_hopeless and not before_at_first.is_clearly_better(score):
                 tried.append(score)
     tried.sort(key=lambda score: score.mean)
     best = before
@@ -398,15 +423,18 @@ def _best(
         score = yield from _score(settings, events, each, known, before)
         if score.is_hopeless:
             continue
-        is_better = score.is_clearly_better(as_sized if each.changes else before)
+        rival = as_sized if each.changes else before
+        is_better = score.is_clearly_better(rival)
         # In a frame of its own, where no map contradicts it, nothing is compared with the map.
         is_in_map = known is None or score.localised_share > max(0.0, before.localised_share - 0.1)
         if is_better and is_in_map and score.mean > best.mean:
             best = score
+        gain = score.likelihood.count * (score.mean - rival.mean)
+        is_open |= is_in_map and not is_better and gain > LIKELIER
     if best.correction.kind == 'tag_size':
         sized = yield from _sized(settings, events, best.correction, known)
-        return replace(best, correction=sized)
-    return best
+        best = replace(best, correction=sized)
+    return best, is_open and best is before
 
 
 def _sized(

@@ -86,6 +86,14 @@ def test_a_sensor_that_looks_sideways_from_a_mast_is_judged_in_its_own_axes(kind
     assert kind in named(wrong)
 
 
+def test_more_of_the_drive_is_looked_at_where_less_leaves_it_open(monkeypatch):
+    monkeypatch.setattr('slam_observer_ros.runs.mistakes.DRIVE_S', 6.0)
+    monkeypatch.setattr('slam_observer_ros.runs.mistakes.TURNED_RAD', 0.0)
+    longer = list(MADE['tag_size'].apply(drive(seconds=13.0)))
+    assert named(first_drive(longer)) == []
+    assert named(longer) == ['tag_size']
+
+
 def test_two_mistakes_are_both_named():
     twice = MADE['points_in_millimetres'].apply(MADE['points_in_optical_axes'].apply(drive()))
     assert set(named(list(twice))) == {'points_in_millimetres', 'points_in_optical_axes'}
