@@ -9,6 +9,7 @@ of the seeds, and report the other half.
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -27,10 +28,12 @@ import worlds
 from worlds import World
 
 from slam_observer_ros.common.findings import Finding, found
+from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.event_warnings import UNEXPECTED_POSES
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.recordings.trajectory import interpolate
+from slam_observer_ros.lie import se3
+from slam_observer_ros.recordings.trajectory import interpolate, LandmarkTruth
 from slam_observer_ros.runs.health import of_estimate, of_map_without_ids, of_rejections
 from slam_observer_ros.runs.metrics import ConfigurationError
 
@@ -229,10 +232,38 @@ def measured(name: str, world: World, draws: range) -> list[float]:
     ]
 
 
+class HypothesesError(ConfigurationError):
+    """The error of a map which is another one when another hypothesis becomes the likeliest.
+
+    A landmark stands for the true one that it was nearest to most often when it was seen, as the
+    hypothesis that is shown now has it: what it was seen as in another one is no mistake of this.
+    """
+
+    def note(self, estimator: Estimator, true_pose: FloatArray, truth: LandmarkTruth) -> None:
+        """Count what an observation shows landmarks without ids to be, in each hypothesis."""
+        there = se3.transform(se3.inverse(true_pose), truth.world_points)
+        for state in estimator._hypotheses.states:
+            rows = np.flatnonzero(state.landmarks.last_seen_ns == estimator.stamp_ns)
+            rows = rows[is_automatic(state.landmarks.ids[rows])]
+            points, ids = state.observer.body_points(rows), state.landmarks.ids[rows].tolist()
+            # Copies of a state share what it was given: that is replaced, and never changed.
+            seen_as = dict(getattr(state, 'seen_as', {}))
+            for point, i in zip(points, ids, strict=True):
+                nearest = int(truth.ids[np.argmin(np.linalg.norm(there - point, axis=1))])
+                seen_as[i] = seen_as.get(i, Counter()) + Counter([nearest])
+            setattr(state, 'seen_as', seen_as)  # noqa: B010 (a state has no such field)
+        self._shown: dict[int, Counter[int]] = getattr(estimator._hypotheses.best, 'seen_as')  # noqa: B009
+
+    def true_ids(self, ids: IntArray) -> IntArray:
+        """Return the true landmark (n,) that each stands for; its own id where it had one."""
+        most = {i: seen.most_common(1)[0][0] for i, seen in self._shown.items()}
+        return np.array([most.get(i, i) for i in ids.tolist()], dtype=np.int64)
+
+
 def run(world: World) -> Outcome:
     """Feed a world to the estimator, and compare each state with the truth."""
     estimator = Estimator(replace(world.settings, gains='riccati'))
-    error, cpu_s, start_s, count = ConfigurationError(), 0.0, time.process_time(), 0
+    error, cpu_s, start_s, count = HypothesesError(), 0.0, time.process_time(), 0
     for event in world.events:
         estimator.add(event)
         if not isinstance(event, ObservationEvent):
@@ -242,13 +273,15 @@ def run(world: World) -> Outcome:
         update = estimator.last_update
         if is_covered[0] and update is not None:
             count += 1
+            truth = world.landmarks_at(event.stamp_ns)
+            error.note(estimator, true_pose[0], truth)
             error.add(
                 event.stamp_ns,
                 estimator.pose,
                 estimator.landmark_ids,
                 estimator.world_points,
                 true_pose[0],
-                world.landmarks_at(event.stamp_ns),
+                truth,
                 None if error.nees and count % NEES_EVERY else estimator.configuration_covariance,
                 update.ids[~update.rejected],
             )
