@@ -109,11 +109,14 @@ WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000
 LEAST_DRIVEN_S = 20.0
 """Driving that says something; the most that a search may then take is left of a minute."""
 
-PERIOD_S, SLICE_S = 0.05, 0.01
+PERIOD_S, SLICE_S = 0.03, 0.01
 """How often a search goes on, and for how long, so that no message waits for it."""
 
 PAUSE_S = 60.0
-"""Time between two searches: before, most of the events are the same."""
+"""Time between the starts of two searches, at most: before, most of the events are the same.
+
+Where less was driven than in that time, new events are as many as old ones sooner.
+"""
 
 
 class MistakeWatch:
@@ -154,7 +157,10 @@ class MistakeWatch:
         if self._search is not None or time.monotonic() < self._next_s:
             return
         is_suspicious = has_slipped or any(each.kind in SUSPICIOUS for each in findings)
-        if (is_suspicious or self.findings) and Drive(self._events).driven_s > LEAST_DRIVEN_S:
+        if not is_suspicious and not self.findings:
+            return
+        if (driven_s := Drive(self._events).driven_s) > LEAST_DRIVEN_S:
+            self._next_s = time.monotonic() + min(driven_s, PAUSE_S)
             maps = self._estimator.loaded_maps
             self._search = self._begin_search(
                 self._estimator.settings, list(self._events), maps or None
@@ -165,7 +171,6 @@ class MistakeWatch:
         if self._search is not None and self._search.advance(SLICE_S):
             before = {finding.kind for finding in self.findings}
             self.findings, self._search = self._search.findings, None
-            self._next_s = time.monotonic() + PAUSE_S
             for finding in self.findings:
                 if finding.kind not in before:
                     self._node.get_logger().error(finding.text())

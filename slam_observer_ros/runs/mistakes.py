@@ -269,6 +269,12 @@ SURE, CLEAR = 25.0, 0.05
 LIKELIER = math.log(20.0)
 """The same for all points, of a correction that more of the drive may show to be right."""
 
+WEAK = 1.0
+"""The same for each point on average, of a mistake that may be a symptom of a pair.
+
+What is right gains several as a rule, but sizes of tags, which wheels are to show.
+"""
+
 STRETCH_NS, THROUGHOUT = to_ns(5.0), 0.25
 """Stretches of a drive, and the share of them that is likelier at least if a mistake explains it.
 
@@ -368,9 +374,10 @@ def _judged(
     best, is_open = yield from _best(settings, events, early, before, singles, known)
     if is_open and not is_all:
         return None
-    if best is before:
-        # As with points in millimetres and in a camera's axes, where no single one helps.
-        best, _ = yield from _best(settings, events, early, before, PAIRS, known)
+    if best is before or best.mean - before.mean < WEAK:
+        # As with points in millimetres and in a camera's axes, where no single one helps much.
+        pair, _ = yield from _best(settings, events, early, before, PAIRS, known)
+        best = pair if pair.is_clearly_better(best) else best
     silent = []
     if is_silent and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
         silent = [found('no_turning')]
@@ -410,7 +417,7 @@ def _best(
         'tag_size': is_flat(np.reshape(moves, (-1, 6))) or not settings.two_d_mode,
     }
     for each in corrections:
-        if may_be.get(each.kind, True):
+        if all(may_be.get(part.kind, True) for part in each.parts or (each,)):
             score = yield from _score(settings, at_first, each, known, before)
             if not score.is_hopeless and not before_at_first.is_clearly_better(score):
                 tried.append(score)

@@ -49,13 +49,13 @@ def surveyed(seed=0):
     return LandmarkMap(np.arange(25), points, covariances, np.zeros(25, dtype=np.int64))
 
 
-def drive(seed=0, seconds=20.0, false=0.0):
+def drive(seed=0, seconds=20.0, false=0.0, turn=0.5):
     """Events of a robot that drives an eight among landmarks, as noisy as stated."""
     rng, events, A = np.random.default_rng(seed), [], np.eye(4)
     landmarks = landmarks_of(rng)
     for step in range(round(seconds * 1e9 / PERIOD_NS)):
         stamp_ns, dt_s = (step + 1) * PERIOD_NS, PERIOD_NS * 1e-9
-        V = np.array([0.0, 0.0, 0.5 if step % 250 < 125 else -0.5, 0.6, 0.0, 0.0])
+        V = np.array([0.0, 0.0, turn if step % 250 < 125 else -turn, 0.6, 0.0, 0.0])
         noise = np.array([0.0, 0.0, 0.02, 0.02, 0.0, 0.0]) * rng.normal(size=6) / math.sqrt(dt_s)
         events.append(VelocityEvent(stamp_ns - PERIOD_NS, V + noise))
         A = A @ se3.exp(dt_s * V)

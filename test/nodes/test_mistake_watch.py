@@ -64,6 +64,19 @@ def test_it_costs_nothing_where_all_fits_or_little_was_driven(
     assert watched.timer.reset.called == looks
 
 
+def test_it_looks_again_once_it_has_driven_for_as_long_again(monkeypatch):
+    now_s = [0.0]
+    clock = SimpleNamespace(monotonic=lambda: now_s[0])
+    monkeypatch.setattr('slam_observer_ros.nodes.diagnostics.time', clock)
+    watched, node = watch(drive(seconds=25.0))
+    for now_s[0], looks in [(25.0, True), (45.0, False), (51.0, True)]:
+        watched.timer.reset.reset_mock()
+        watched.look(SLIP, has_slipped=False)
+        assert watched.timer.reset.called == looks
+        if looks:
+            searched(watched, node)
+
+
 def test_what_is_of_another_time_is_forgotten():
     watched, _ = watch(drive(seconds=40.0))
     watched.clear()

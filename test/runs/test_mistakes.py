@@ -36,6 +36,12 @@ def test_where_all_is_right_nothing_is_named(factor, false):
     assert named(drive(seed=1, false=false), settings) == []
 
 
+def test_who_goes_straight_on_does_not_turn_in_degrees():
+    """Undoing that takes the noise of the turning away, which is stated too small."""
+    settings = replace(SETTINGS, angular_velocity_noise=(0.0, 0.0, 0.02 / 3.0))
+    assert named(drive(seconds=15.0, turn=0.0), settings) == []
+
+
 def test_what_differs_by_a_mirror_or_by_the_front_alone_is_named_with_its_like():
     mirrored, backwards = (named(list(MADE[kind].apply(drive()))) for kind in ALIKE)
     assert mirrored == ['points_mirrored', 'turning_negated']
