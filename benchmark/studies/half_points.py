@@ -42,7 +42,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.recordings.data_sets import load_plaza
-from slam_observer_ros.recordings.trajectory import Trajectory
+from slam_observer_ros.recordings.trajectory import associate, Trajectory
 from slam_observer_ros.runs.metrics import trajectory_errors
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -292,33 +292,47 @@ class Hall:
 
 
 def write_halls(kind: int, seeds: Sequence[int]) -> None:
-    """Write by how much errors are larger than in a surveyed map, and what has entered."""
-    ratios, smoothed, anees, entered, wrong, count = [], [], [], 0, 0, 0
+    """Write by how much errors are larger than in a surveyed map, and what has entered.
+
+    Errors are at the best size: without a survey odometry alone says it, by its unknown scale.
+    """
+    rows: list[tuple[float, ...]] = []
+    entered = wrong = count = 0
     for seed in seeds:
         hall = Hall.random(seed, kind)
         known, of_known, _ = hall.drive(is_surveyed=True)
-        found, of_found, consistency = hall.drive(is_surveyed=False)
+        found, of_found, anees = hall.drive(is_surveyed=False)
         seen = {id_ for e in hall.events if isinstance(e, ObservationEvent) for id_ in e.ids}
-        errors = [
-            trajectory_errors(each, hall.truth).ate_rmse_m
-            for each in (of_found, of_known, *(smooth(each) for each in (found, known)))
-        ]
+        each = (of_found, of_known, smooth(found), smooth(known))
+        errors, sizes = zip(*(sized_errors(path, hall.truth) for path in each), strict=True)
         off_m = np.linalg.norm(found.world_points - hall.points[found.landmark_ids], axis=1)
         sigmas_m = np.sqrt(np.trace(np.asarray(found.landmark_covariances), axis1=1, axis2=2))
         far = int(((off_m > 4.0 * sigmas_m) & (off_m > 0.5)).sum())
-        ratios.append(errors[0] / errors[1])
-        smoothed.append(errors[2] / errors[3])
-        anees.append(consistency)
+        rows.append((errors[0] / errors[1], errors[2] / errors[3], sizes[2], anees))
         entered, count, wrong = entered + len(off_m), count + len(seen), wrong + far
         sys.stdout.write(
             f'{seed:3} {errors[0]:.3f} {errors[1]:.3f} smoothed {errors[2]:.3f} {errors[3]:.3f}, '
-            f'{len(off_m)} of {len(seen)} entered, {far} off, ANEES {consistency:.2f}\n'
+            f'{len(off_m)} of {len(seen)} entered, {far} off, size {sizes[2]:.3f}, '
+            f'ANEES {anees:.2f}\n'
         )
-    for name, each in (('ATE', ratios), ('smoothed', smoothed), ('ANEES', anees)):
-        if each:
-            median, worst = np.percentile(each, [50, 90])
-            sys.stdout.write(f'{name} {median:.2f}, {worst:.2f} (median, 90 %)\n')
-    sys.stdout.write(f'halls, kind {kind}: {entered} of {count} entered, {wrong} far off\n')
+    if rows:
+        spread = np.percentile(rows, [10, 50, 90], axis=0).T
+        for name, each_ in zip(('ATE', 'smoothed', 'size', 'ANEES'), spread, strict=True):
+            sys.stdout.write(f'{name} {each_.round(2).tolist()} (10, 50, 90 %)\n')
+        sys.stdout.write(f'halls, kind {kind}: {entered} of {count} entered, {wrong} far off\n')
+
+
+def sized_errors(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
+    """Return the position error after alignment with a free size, metres, and that size."""
+    paired, true_paired, _ = associate(estimate, truth)
+    spreads = [float(np.ptp(each.positions, axis=0).max()) for each in (paired, true_paired)]
+    poses = paired.poses.copy()
+    best = (math.inf, 1.0)
+    for size in np.linspace(0.8, 1.2, 41) * spreads[1] / max(spreads[0], 1e-3):
+        poses[:, :3, 3] = size * paired.positions
+        error_m = trajectory_errors(Trajectory(paired.stamps_ns, poses), truth).ate_rmse_m
+        best = min(best, (error_m, 1.0 / size))
+    return best
 
 
 def smooth(estimator: Estimator) -> Trajectory:
@@ -333,7 +347,9 @@ def write_straight(kind: int, seeds: Sequence[int]) -> None:
     for seed in seeds:
         hall = Hall.random(seed, kind, duration_s=25.0, straight=True)
         estimator, *_ = hall.drive(is_surveyed=False)
-        y = estimator.world_points[:, 1], hall.points[estimator.landmark_ids, 1]
+        seen = estimator.world_points, hall.points[estimator.landmark_ids]
+        from_ = se3.inverse(np.array([estimator.pose, hall.truth.poses[-1]]))
+        y = [se3.transform(back, each)[:, 1] for back, each in zip(from_, seen, strict=True)]
         entered, count = entered + len(y[0]), count + len(hall.points)
         wrong += int(((y[0] * y[1] < 0.0) & (np.abs(y[0] - y[1]) > 1.0)).sum())
         open_ += len(estimator.open_sides)

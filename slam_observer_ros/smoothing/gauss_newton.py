@@ -16,6 +16,7 @@ Outliers are reweighted in each iteration (Huber).
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from types import ModuleType
 
 import numpy as np
@@ -55,6 +56,10 @@ class Step:
     def marginal(self) -> FloatArray:
         """Return the covariance of (η, dc, dp) at ``start``, η and dc being the last ones."""
         return self.factors.marginal()
+
+
+MOST_HALVED = 8
+"""Times at most that a step is halved."""
 
 
 class Smoother:
@@ -108,6 +113,41 @@ class Smoother:
                 break
             start = step.end
         return step
+
+    def descend(self, start: Solution, iterations: int, tolerance: float) -> tuple[Step, float]:
+        """Return the last step, as :meth:`smooth`, and the cost at its end, which is the least.
+
+        A step that would go up is halved until it does not: so far from the end it is too long.
+        """
+        cost = self.cost(start)  # which completes half points as well
+        for _ in range(iterations):
+            factors = self._factors(start, gated=False)
+            change, border_change = factors.solve()
+            before, cost = cost, math.inf
+            for share in 0.5 ** np.arange(MOST_HALVED):
+                end = self._moved(start, share * change, share * border_change)
+                if (cost := self.cost(end)) < before:
+                    break
+            step = Step(start, end if cost < before else start, factors)
+            if cost > before - tolerance:
+                break
+            start = step.end
+        return step, min(cost, before)
+
+    def cost(self, solution: Solution) -> float:
+        """Return −2 ln of the likelihood of all at a solution, but for a constant."""
+        self._complete(solution)
+        error = self._links(solution)[1]
+        cost = float(np.einsum('si,sij,sj->', error, self._link_information, error))
+        at = solution.poses[0], solution.calibrations[0], solution.points, solution.orientations
+        information, gradient = self._prior.normal_equations(
+            self._axes, self._prior_information, *at
+        )
+        cost += float(gradient @ np.linalg.lstsq(information, gradient)[0])
+        if (besides := self._prior.besides) is not None:
+            values = solution.calibrations[0]
+            cost += float(values @ (besides[0] @ values - 2.0 * besides[1]))
+        return cost + self._observations.cost(solution)
 
     def _complete(self, solution: Solution) -> None:
         """Complete half points by a solution."""

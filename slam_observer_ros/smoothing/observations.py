@@ -14,6 +14,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.filter.arrays import flip_verdicts
+from slam_observer_ros.filter.robust import huber_loss
 from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.axes import EstimatedAxes
 from slam_observer_ros.lie.matrices import transpose
@@ -185,6 +186,11 @@ class Observations:
         information = keyframes.information.copy()
         information[half] = _expected(before, expected, information[half], kinds)
         return replace(keyframes, points=points, information=information), sensed
+
+    def cost(self, solution: Solution) -> float:
+        """Return −2 ln of the likelihood of all points, as Huber has it, but for a constant."""
+        squared = _squared_distances(self._of_points(solution)[2], self._keyframes.information)
+        return float(self._keyframes.shares @ huber_loss(np.sqrt(squared)))
 
     def some_are_gated(self, solution: Solution) -> bool:
         """Return whether a filter would reject some of the points."""

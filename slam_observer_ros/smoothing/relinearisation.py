@@ -22,7 +22,7 @@ from copy import copy
 from dataclasses import replace
 import logging
 import math
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -80,6 +80,9 @@ ITERATIONS, TOLERANCE = 2, 2e-2
 ENTRY_ITERATIONS = 10
 """Steps at most where a landmark enters, by which all since it was seen first is corrected."""
 
+PLACING_ITERATIONS, COST_TOLERANCE = 40, 0.1
+"""Steps at most to see where a landmark is, and by how much one has to be better at least."""
+
 SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
 """The same for smoothing everything."""
 
@@ -87,9 +90,12 @@ SLIP_TOLERANCE = 1e-4
 """Change below which a solution will do to judge slips by."""
 
 
-Place: TypeAlias = tuple[FloatArray, FloatArray]
-"""Where a landmark is (3,), and its covariance (k, k) as seen from the robot, by given scales of
-ranges and mountings of sensors, m²."""
+class Placed(NamedTuple):
+    """Where a landmark is, by views of it."""
+
+    point: FloatArray  # (3,)
+    covariance: FloatArray  # (k, k) as seen from the robot, by given scales and mountings, m²
+    cost: float  # −2 ln of the likelihood, but for a constant
 
 
 class KnownErrors(Protocol):
@@ -146,7 +152,7 @@ class Past:
         """Return the poses (4, 4) of marked observations; None where that is not known."""
         return [None for _ in marks]
 
-    def placed(self, point: FloatArray, seen: Keyframe) -> Place | None:
+    def placed(self, point: FloatArray, seen: Keyframe) -> Placed | None:
         """Return where a landmark is that was ``seen`` in marked observations, near a point (3,).
 
         By all that was seen since the summary. None where that is not kept, or leaves it open.
@@ -283,7 +289,7 @@ class Relinearisation(Past):
         history = self.history
         return [None if at < 0 else history.poses[at + 1] for at in history.marked(marks)]
 
-    def placed(self, point: FloatArray, seen: Keyframe) -> Place | None:
+    def placed(self, point: FloatArray, seen: Keyframe) -> Placed | None:
         """Return where a landmark is that was ``seen`` in marked observations, near a point (3,).
 
         By all that was seen since the summary. None where that is not kept, or leaves it open.
@@ -302,7 +308,7 @@ class Relinearisation(Past):
         )
         try:
             smoother = self._smoother(history.summary, history.latest_keyframes().with_more(views))
-            step = smoother.smooth(solution, ENTRY_ITERATIONS, TOLERANCE)
+            step, cost = smoother.descend(solution, PLACING_ITERATIONS, COST_TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             return None
@@ -321,7 +327,7 @@ class Relinearisation(Past):
         joint = joint @ covariance @ joint.T
         shared = joint[:k, k:] @ np.linalg.pinv(joint[k:, k:])
         there = se3.transform(history.poses[-1], y)[0]
-        return there, joint[:k, :k] - shared @ joint[k:, :k]
+        return Placed(there, joint[:k, :k] - shared @ joint[k:, :k], cost)
 
     def enter(self, row: int, seen: Keyframe) -> None:
         """Let marked observations (m,) be all that a landmark was ``seen`` in.

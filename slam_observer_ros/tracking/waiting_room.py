@@ -2,9 +2,9 @@
 
 k half measurements and the way between them are one point, seen now, with a covariance: by
 generalised least squares from starts all around, where the noise of the way is a random walk
-between the views. Two minima that both fit, as on both sides of a straight way, are left open
-until a curve decides. Where the past is kept, all that is known since has to
-agree that the place is sure, and the views take the place of the point once it has entered.
+between the views. Where the past is kept, all that was seen since is linearised again at each of
+these places, and the views take the place of the point once it has entered. Two places that both
+fit, as on both sides of a straight way, are left open until a curve decides.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from slam_observer_ros.events import ObservationEvent, RANGE
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.sensor_mounting import directions_of, MEASURED, Sensed, UNMEASURED_M
 from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.smoothing.relinearisation import Placed
 
 if TYPE_CHECKING:
-    from slam_observer_ros.smoothing.relinearisation import Place
     from slam_observer_ros.tracking.state import State
 
 MOST_VIEWS, FEWEST_VIEWS = 80, 8
@@ -44,8 +44,13 @@ FURTHEST_RAD = 0.7
 MOST_TURN_RAD = 0.3
 """Standard deviation of a turn up to which the way since a view is known well: it is linear."""
 
-SURE_RANGES, SURE_BEARINGS = 0.05, 0.1
-"""Largest standard deviation of a point, as a share of its distance, that is linear enough."""
+SURE_RANGES, SURE_BEARINGS = 0.2, 0.4
+"""Largest standard deviation of a point, as a share of its least distance, that is linear enough
+to begin with: as it enters all is linearised again.
+
+In random halls half as much lets landmarks enter later, with errors a sixth larger; a quarter
+leaves some of them out.
+"""
 
 FITS, APART = 2.5, 30.0
 """χ² per view of a solution that fits, and by how much more another one has that does not.
@@ -53,13 +58,16 @@ FITS, APART = 2.5, 30.0
 The odds of the side are e^15 then, beside errors of the way that are twice as stated e^4.
 """
 
-SIDE = 3.0
-"""Times the noise of the way by which views lie off a straight line, if that decides a side."""
+SAME, LEAST_APART_M = 1.0, 0.01
+"""Standard deviations within which two minima are one, beside what a descent may leave."""
+
+MOST_PLACES = 4
+"""Places that are compared by all that was seen since."""
 
 MOST_AT_ONCE = 4
 """Sensors, or kinds of views of one, that may show a landmark at once."""
 
-HUBER, STEPS = 2.0, 15
+HUBER, STEPS = 2.0, 20
 DEPTHS_M = (1.0, 4.0, 15.0)
 """Distances along a bearing from which a solution is sought."""
 
@@ -233,28 +241,50 @@ class WaitingRoom:
             for each, pose in zip(views, poses, strict=True)
         ]
         problem = _PlaceProblem(now, self._way.covariance, state)
-        found = problem.solve(state.settings.range_scale_stddev)
+        found = problem.solve()
         self.open_sides.discard(landmark_id)
-        if found is None:
-            if problem.side_is_open:
-                self.open_sides.add(landmark_id)
+        earlier = _as_seen(state, [each for each in views if each.number < self._observations])
+        place, has_rival = self._placed(state, problem, found, earlier)
+        if has_rival:
+            self.open_sides.add(landmark_id)
+        if place is None or has_rival:
             return None
-        # All that is known since of where the robot was says more than odometry alone. But of
-        # directions it is too near the robot, and too sure, while the distance is open.
-        earlier = [each for each in views if each.number < self._observations]
-        again = state.relinearisation.placed(found[0], _as_seen(state, earlier))
-        place = found if again is None else again
-        are_sure = [_is_sure(state, view, each) for each in (place, found)]
-        if not (are_sure[0] and (view.is_range or are_sure[1])):
-            return None
-        point, of_point = place[0], found[1]
         self._entered[landmark_id] = list(views)
         for kept in (self._views, self._seen, self._next):
             del kept[landmark_id]
         R, _, scale = sensor_values(state, view.sensor_frame)
-        in_body = view.pose[:3, :3].T @ (point - view.seen(state)[0])
+        k, of_point = state.axes.point, np.zeros((3, 3))
+        of_point[:k, :k] = place.covariance
         turned = R.T @ view.pose[:3, :3].T
-        return R.T @ in_body / scale, turned @ of_point @ turned.T / scale**2
+        line = turned @ (place.point - view.seen(state)[0])
+        return line / scale, turned @ of_point @ turned.T / scale**2
+
+    def _placed(
+        self, state: State, problem: _PlaceProblem, found: list[Placed], seen: Keyframe
+    ) -> tuple[Placed | None, bool]:
+        """Return which of the places ``found`` is sure, if any, and whether another fits, too.
+
+        All that is known since of where the robot was says more than odometry alone.
+        """
+        if not found:
+            return None, False
+        place, has_rival = found[0], any(_is_rival(each, found[0]) for each in found)
+        past = state.relinearisation
+        again = past.placed(place.point, seen)
+        if again is None:
+            return place if problem.is_sure(place) else None, has_rival
+        starts = [each.point for each in found[1:]]
+        if problem.has_ranges:  # which fit on the other side of the way, too
+            starts.insert(0, problem.mirrored(again.point))
+        for point in starts:
+            if not problem.is_sure(again):
+                return None, has_rival
+            other = past.placed(point, seen)
+            if other is not None:
+                again, other = sorted((again, other), key=lambda each: each.cost)
+                if _is_rival(other, again):
+                    return None, True
+        return again if problem.is_sure(again) else None, False
 
     def remember(self, states: Sequence[State]) -> bool:
         """Keep views, to be linearised again; return whether a landmark has entered."""
@@ -270,12 +300,16 @@ class WaitingRoom:
         return bool(entered)
 
 
-def _is_sure(state: State, view: WaitingView, place: Place) -> bool:
-    """Return whether a place is known so well that what is seen of it is linear."""
-    k, (point, covariance) = state.axes.point, place
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:k, :k])[-1]))
-    sure = SURE_RANGES if view.is_range else SURE_BEARINGS
-    return sigma_m < sure * float(np.linalg.norm(point - view.seen(state)[0]))
+def _is_rival(other: Placed, best: Placed) -> bool:
+    """Return whether another place than the best one fits nearly as well."""
+    return other.cost < best.cost + APART and not _is_same(other, best)
+
+
+def _is_same(other: Placed, place: Placed) -> bool:
+    """Return whether two places are one, within the errors of the second."""
+    off = (other.point - place.point)[: len(place.covariance)]
+    P = place.covariance + LEAST_APART_M**2 * np.eye(len(off))
+    return bool(off @ np.linalg.solve(P, off) < SAME**2)
 
 
 def _as_seen(state: State, views: list[WaitingView]) -> Keyframe:
@@ -321,151 +355,135 @@ class _PlaceProblem:
     """Where a landmark is (k,), by views and the way between them."""
 
     def __init__(self, views: list[WaitingView], walk: FloatArray, state: State) -> None:
-        self._k, self._views = state.axes.point, views
-        self.side_is_open = False  # as the solution has shown
+        self._k = k = state.axes.point
+        self._scale_sigma = state.settings.range_scale_stddev
         seen = np.array([view.seen(state) for view in views])
         self._origins, self._lines = seen[:, 0], seen[:, 1]
         self._lengths = np.linalg.norm(self._lines, axis=1)
         self._is_range = np.array([view.is_range for view in views])
-        self._variances = np.array([view.variances for view in views])
+        self.has_ranges = bool(self._is_range.any())
+        # A range has one row, a direction one for each axis across: azimuth, then elevation.
+        of_view = np.where(self._is_range, 1, k - 1)
+        self._at = at = np.repeat(np.arange(len(views)), of_view)  # (q,)
+        self._axis = np.arange(len(at)) - np.repeat(np.cumsum(of_view) - of_view, of_view)
+        self._axis[~self._is_range[at]] += 1
+        variances = np.array([view.variances for view in views])
+        self._variances = variances[at, self._axis]
         # What is common to two views is the way from the later one of them until now.
-        left = walk - np.array([view.walk for view in views])
-        n = len(views)
-        later = np.maximum(np.arange(n)[:, None], np.arange(n)[None, :])
-        self._ways = left[later]
-        self._plane = np.array([0.0, 0.0, 1.0])
+        self._ways = (walk - np.array([view.walk for view in views]))[at]
 
-    def solve(self, scale_sigma: float) -> tuple[FloatArray, FloatArray] | None:
-        """Return the point (3,) and its covariance (3, 3); None while something is open.
+    def solve(self) -> list[Placed]:
+        """Return places that the views fit, the best one first; none where even that does not.
 
-        A common factor of the ranges moves it along the line of sight, which the step knows, and
-        a little otherwise, which is added to the covariance.
+        A common factor of the ranges moves a place along the line of sight, which the step knows,
+        and a little otherwise, which is added to the covariance.
         """
-        if self._is_range.all() and not self._curve_decides():
-            self.side_is_open = True
-            return None
-        solutions = [each for p in self._starts() if (each := self._descend(p)) is not None]
-        if not solutions:
-            return None
-        best = min(solutions, key=lambda each: each[0])
-        mirrored = self._descend(self._mirrored(best[1])) if self._is_range.any() else None
-        solutions += [] if mirrored is None else [mirrored]
-        cost, p, C = min(solutions, key=lambda each: each[0])
-        if cost > FITS * len(self._views):
-            return None
-        for other_cost, q, _ in solutions:
-            d = (q - p)[: self._k]
-            away = d @ np.linalg.solve(C + 1e-4 * np.eye(self._k), d)
-            if other_cost < cost + APART and away > 9.0:
-                self.side_is_open = True
-                return None
-        e, H, R = self._parts(p)
-        lengths = np.where(self._is_range, self._lengths, 0.0)
-        if len(e) == len(lengths):
-            shift = scale_sigma * (C @ H.T @ np.linalg.solve(R, lengths))
-            shift -= scale_sigma * (p - self._origins[-1])[: self._k]
-            C = C + np.outer(shift, shift)
-        covariance = np.zeros((3, 3))
-        covariance[: self._k, : self._k] = C
-        return p, covariance
+        minima = self._descend(self._starts())
+        if minima and self.has_ranges:
+            mirrored = self.mirrored(min(minima, key=lambda each: each.cost).point)
+            minima += self._descend(mirrored[None])
+        minima.sort(key=lambda each: each.cost)
+        if not minima or minima[0].cost > FITS * len(self._lengths):
+            return []
+        places: list[Placed] = []
+        for each in minima:
+            if each.cost > minima[0].cost + 2.0 * APART or len(places) == MOST_PLACES:
+                break
+            if not any(_is_same(each, other) for other in places):
+                places.append(each)
+        return [self._with_scale(each) for each in places] if self._is_range.all() else places
 
-    def _starts(self) -> list[FloatArray]:
+    def is_sure(self, place: Placed) -> bool:
+        """Return whether a place is known so well that all that was seen of it is linear."""
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(place.covariance)[-1]))
+        distance_m = float(np.linalg.norm(place.point - self._origins, axis=1).min())
+        # Far away the completion alone says where it is.
+        sure = SURE_RANGES if self._is_range[-1] else SURE_BEARINGS
+        return sigma_m < sure * min(distance_m, 0.1 * UNMEASURED_M)
+
+    def _with_scale(self, place: Placed) -> Placed:
+        """Return a place whose covariance has the factor of the ranges in it."""
+        _, H, R = self._parts(place.point[None])
+        at = H[0, :, : self._k]
+        shift = place.covariance @ at.T @ np.linalg.solve(R[0], self._lengths)
+        shift -= (place.point - self._origins[-1])[: self._k]
+        scale = self._scale_sigma**2 * np.outer(shift, shift)
+        return place._replace(covariance=place.covariance + scale)
+
+    def _starts(self) -> FloatArray:
+        """Return points (b, 3) all around, or along the last direction."""
         origin = self._origins[-1]
         if not self._is_range.all():
             row = int(np.flatnonzero(~self._is_range)[-1])
             direction = self._lines[row] / self._lengths[row]
-            return [self._origins[row] + depth_m * direction for depth_m in DEPTHS_M]
-        length_m = float(np.median(self._lengths))
-        turns = np.arange(8) * np.pi / 4
-        level = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(8)])
-        rises = (0.0,) if self._k == 2 else (0.7, -0.7)
-        return [
-            origin + length_m * (np.cos(rise) * each + np.sin(rise) * self._plane)
-            for rise in rises
-            for each in level
-        ]
+            along: FloatArray = self._origins[row] + np.array(DEPTHS_M)[:, None] * direction
+            return along
+        turns = np.arange(12) * np.pi / 6
+        level = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(12)])
+        rises = np.array([0.0] if self._k == 2 else [0.7, -0.7])[:, None, None]
+        around = np.cos(rises) * level + np.sin(rises) * [0.0, 0.0, 1.0]
+        starts: FloatArray = origin + self._lengths[-1] * around.reshape(-1, 3)
+        return starts
 
     def _parts(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return residuals (q,), how they change with p (q, k), and their covariance (q, q)."""
-        d = p - self._origins
-        r = np.maximum(np.linalg.norm(d, axis=1), 0.05)
-        u = d / r[:, None]
-        rows, e, H = [], [], []
-        sigma2 = []
-        across = self._across(u)
-        for i in range(len(r)):
-            if self._is_range[i]:
-                rows.append(i)
-                e.append(self._lengths[i] - r[i])
-                H.append(u[i])
-                sigma2.append(self._variances[i, 0])
-                continue
-            shown = self._lines[i] / self._lengths[i]
-            for axis in range(self._k - 1):
-                rows.append(i)
-                b = across[i, axis]
-                # Beyond a right angle the projection would become smaller again.
-                angle = np.arctan2(shown @ b, shown @ u[i])
-                e.append(angle)
-                H.append(b / r[i])
-                sigma2.append(self._variances[i, 1 + axis])
-        at = np.array(rows)
-        jacobian = np.array(H)
+        """Return residuals (b, q), how they change with points (b, q, 3), covariances (b, q, q).
+
+        Of points p (b, 3).
+        """
+        d = p[:, None] - self._origins[self._at]
+        r = np.maximum(np.linalg.norm(d, axis=2), 0.05)
+        directions = directions_of(d.reshape(-1, 3)).reshape(*d.shape, 3)
+        u = directions[:, :, 0]
+        b = np.take_along_axis(directions, self._axis[None, :, None, None], axis=2)[:, :, 0]
+        lines, ranges = self._lines[self._at], self._is_range[self._at]
+        # Beyond a right angle the projection would become smaller again.
+        angles = np.arctan2((lines * b).sum(axis=2), (lines * u).sum(axis=2))
+        e = np.where(ranges, self._lengths[self._at] - r, angles)
+        H = np.where(ranges[:, None], b, b / r[:, :, None])
         # A turn ω and shift of the frame of the view move p − o by −(ω × p + shift).
-        g = np.concatenate([-np.cross(p[None], jacobian), -jacobian], axis=1)
-        ways = self._ways[np.ix_(at, at)]
-        R = np.einsum('ia,ijab,jb->ij', g, ways, g) + np.diag(np.array(sigma2))
-        return np.array(e), jacobian[:, : self._k], R
+        g = np.concatenate([-np.cross(p[:, None], H), -H], axis=2)
+        later = np.triu(g @ np.einsum('qij,bqj->biq', self._ways, g))
+        R = later + np.triu(later, 1).transpose(0, 2, 1)
+        R[:, np.arange(len(self._at)), np.arange(len(self._at))] += self._variances
+        return e, H, R
 
-    def _across(self, u: FloatArray) -> FloatArray:
-        first = np.cross(self._plane, u)
-        first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
-        return np.stack([first, np.cross(u, first)], axis=1)
-
-    def _descend(self, start: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
-        """Return χ², point and covariance (k, k) of the minimum near a start; None without one."""
-        p, k, weights = start.copy(), self._k, None
-        cost, C = np.inf, np.eye(k)
-        reach_m = 0.5 * max(float(np.median(self._lengths)), 1.0)
+    def _descend(self, starts: FloatArray) -> list[Placed]:
+        """Return the minima that starts (b, 3) lead to."""
+        k, p, n = self._k, starts.copy(), len(starts)
+        best, costs, damping = p, np.full(n, np.inf), np.full(n, 1e-3)
+        H_best, g_best = np.zeros((n, k, k)), np.zeros((n, k))
         for _ in range(STEPS):
             e, H, R = self._parts(p)
-            w = np.ones(len(e)) if weights is None else weights
-            W = np.linalg.inv(R / np.sqrt(np.outer(w, w)))
-            information = H.T @ W @ H
-            information += 1e-9 * np.trace(information) * np.eye(k)
-            step = np.linalg.solve(information, H.T @ W @ e)
-            size_m = float(np.linalg.norm(step))
-            cost, C = float(e @ W @ e), np.linalg.inv(information)
-            p[:k] += step * min(1.0, reach_m / max(size_m, 1e-12))
-            off = np.abs(e) / np.sqrt(np.diagonal(R))
-            weights = HUBER / np.maximum(off, HUBER)
-            if size_m < 1e-3:
+            off = np.abs(e) / np.sqrt(np.diagonal(R, axis1=1, axis2=2))
+            shares = np.sqrt(HUBER / np.maximum(off, HUBER))[:, :, None]
+            rows = shares * np.concatenate([H[:, :, :k], e[:, :, None]], axis=2)
+            normal = rows.transpose(0, 2, 1) @ np.linalg.solve(R, rows)
+            is_better = normal[:, k, k] < costs
+            best = np.where(is_better[:, None], p, best)
+            costs = np.where(is_better, normal[:, k, k], costs)
+            H_best = np.where(is_better[:, None, None], normal[:, :k, :k], H_best)
+            g_best = np.where(is_better[:, None], normal[:, :k, k], g_best)
+            damping = np.where(is_better, 0.2 * damping, 10.0 * damping)
+            scaled = damping[:, None] * np.diagonal(H_best, axis1=1, axis2=2) + 1e-12
+            step = np.linalg.solve(H_best + scaled[:, :, None] * np.eye(k), g_best[:, :, None])
+            size_m = np.linalg.norm(step, axis=1)
+            if size_m.max() < 1e-3:
                 break
-        if not np.isfinite(p).all():
-            return None
-        behind = ~self._is_range & (np.einsum('ij,ij->i', p - self._origins, self._lines) < 0.0)
-        return None if behind.any() else (cost, p, C)
+            reach_m = 0.5 * np.linalg.norm(best - self._origins[-1], axis=1) + 0.1
+            p = best.copy()
+            p[:, :k] += step[:, :, 0] * np.minimum(1.0, reach_m[:, None] / size_m)
+        ahead = np.einsum('bni,ni->bn', best[:, None] - self._origins, self._lines) > 0.0
+        kept = (ahead | self._is_range).all(axis=1)
+        trace = np.trace(H_best, axis1=1, axis2=2)[:, None, None]
+        C = np.linalg.inv(H_best + 1e-9 * trace * np.eye(k))
+        return [Placed(best[i], C[i], float(costs[i])) for i in np.flatnonzero(kept)]
 
-    def _mirrored(self, p: FloatArray) -> FloatArray:
+    def mirrored(self, p: FloatArray) -> FloatArray:
         """Return the point on the other side of the way, which ranges fit as well."""
-        centre, axes, _ = self._spread()
-        off = p - centre
-        away = axes[:, self._k - 1]
-        mirrored: FloatArray = p - 2.0 * (off @ away) * away
-        return mirrored
-
-    def _spread(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the middle of the origins, their axes (3, 3), the longest first, and extents."""
         centre = self._origins.mean(axis=0)
         values, axes = np.linalg.eigh(np.cov(self._origins.T) + 1e-12 * np.eye(3))
         if self._k == 2:
-            values[np.abs(axes[2]).argmax()] = -1.0
-        order = np.argsort(values)[::-1]
-        return centre, axes[:, order], np.sqrt(np.maximum(values[order], 0.0))
-
-    def _curve_decides(self) -> bool:
-        """Return whether the way lies off a line (or a plane) by more than its own noise."""
-        _, axes, extents = self._spread()
-        away = axes[:, self._k - 1]
-        walk = self._ways[0, 0][3:, 3:]
-        return bool(extents[self._k - 1] > SIDE * np.sqrt(max(float(away @ walk @ away), 1e-8)))
+            values[np.abs(axes[2]).argmax()] = np.inf
+        away = axes[:, np.argmin(values)]
+        mirrored: FloatArray = p - 2.0 * ((p - centre) @ away) * away
+        return mirrored
