@@ -45,6 +45,7 @@ from slam_observer_ros.recordings.data_sets import load_plaza
 from slam_observer_ros.recordings.trajectory import associate, Trajectory
 from slam_observer_ros.runs.metrics import trajectory_errors
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.tracking.waiting_room import FEWEST_VIEWS
 
 DATA = Path(os.environ.get('SLAM_OBSERVER_DATA', '../shared/data')) / 'plaza'
 START_M, START_RAD = 0.05, 0.05
@@ -107,9 +108,9 @@ def main() -> None:
         write_lost(f'halls, {name}', found)
 
 
-def write_lost(name: str, found: Iterable[Found]) -> None:
+def write_lost(name: str, found: Iterable[Found | None]) -> None:
     """Write how many starts were found, how many of them wrong, and after which drive."""
-    results = list(found)
+    results = [each for each in found if each is not None]
     drives = [drive_m for drive_m, _, is_found in results if is_found]
     wrong = sum(off_m > WRONG_M for _, off_m, is_found in results if is_found)
     after = np.percentile(drives, [50, 90]).round(1).tolist() if drives else '–'
@@ -120,17 +121,28 @@ def write_lost(name: str, found: Iterable[Found]) -> None:
 
 
 def lost_on_plaza(run: int) -> Iterator[Found]:
-    """Start lost at any time of the first three quarters of a run."""
+    """Start lost at any time of the first three quarters of a run at which there are ranges.
+
+    Plaza 1 has a gap in which the robot drives for longer than MOST_M without any.
+    """
     events, truth, anchors = read(run)
-    for start in np.random.default_rng(1).integers(50, len(events) * 3 // 4, STARTS):
-        yield lost(events[int(start) :], truth, anchors, shipped_settings('uwb'))
+    rng, count = np.random.default_rng(1), 0
+    while count < STARTS:
+        start = int(rng.integers(50, len(events) * 3 // 4))
+        found = lost(events[start:], truth, anchors, shipped_settings('uwb'))
+        if found is not None:
+            count += 1
+            yield found
 
 
 def lost(
     events: Sequence[Event], truth: Trajectory, anchors: LandmarkMap, config: Settings
-) -> Found:
-    """Drive until the robot is found, or for MOST_M; return drive, error, and whether it was."""
-    estimator, driven_m = Estimator(config), 0.0
+) -> Found | None:
+    """Drive until the robot is found, or for MOST_M; return drive, error, and whether it was.
+
+    None where too little was seen on that drive to search at all.
+    """
+    estimator, driven_m, seen = Estimator(config), 0.0, 0
     estimator.load_map(anchors)
     last: VelocityEvent | None = None
     for event in events:
@@ -144,12 +156,13 @@ def lost(
             at = np.searchsorted(truth.stamps_ns, estimator.stamp_ns or 0).clip(max=len(truth) - 1)
             off = (estimator.pose - truth.poses[at])[:3, 3]
             return driven_m, float(np.linalg.norm(off)), True
+        seen += isinstance(event, ObservationEvent)
         if driven_m > MOST_M:
             break
-    return driven_m, math.nan, False
+    return None if seen < FEWEST_VIEWS else (driven_m, math.nan, False)
 
 
-def lost_in_hall(seed: int, kind: int, in_a_line: bool, walls: float) -> Found:
+def lost_in_hall(seed: int, kind: int, in_a_line: bool, walls: float) -> Found | None:
     """Start lost in a hall of 10 to 40 m with eight anchors, and drive at random."""
     rng, n = np.random.default_rng(seed), 8
     size = rng.uniform(10.0, 40.0, 2)

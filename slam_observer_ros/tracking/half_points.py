@@ -26,7 +26,7 @@ from slam_observer_ros.events import (
     RANGE,
 )
 from slam_observer_ros.filter.robust import straight_odds, straight_share
-from slam_observer_ros.lie.matrices import diagonal_blocks
+from slam_observer_ros.lie.matrices import diagonal_blocks, transpose
 from slam_observer_ros.lie.sensor_mounting import (
     completed_lines,
     directions_of,
@@ -45,6 +45,9 @@ from slam_observer_ros.tracking.waiting_room import (
     WaitingRoom,
     Window,
 )
+
+LEAST_M = 0.05
+"""Least distance of a landmark: its sensor has an extent."""
 
 KEPT, FEWEST = 200, 40
 """Differences of ranges that are kept, and that it takes to judge them."""
@@ -141,6 +144,7 @@ class HalfPoints:
         whole = replace(
             event, points=points, covariances=covariances, kinds=kinds, directions=directions
         )
+        whole = _curved(state, whole, rows)
         covariances = self._without_detours(state, whole, rows, event)
         return replace(whole, covariances=covariances).select(usable)
 
@@ -250,6 +254,50 @@ def _expected_covariances(
         return None
     full = np.zeros((len(rows), 3, 3))
     full[:, :k, :k] = diagonal_blocks(S, k)
+    R = state.observer.A[:3, :3]
+    turned: FloatArray = R.T @ full @ R
+    return turned
+
+
+def _curved(state: State, event: ObservationEvent, rows: IntArray) -> ObservationEvent:
+    """Return completed half points as they are of second order.
+
+    Of δ, by how much a landmark at r may be off along and across its line, a range has δ⊥²/2r
+    besides, and across a direction it is −δ∥ δ⊥/r. With a normal δ these have such means, by which
+    the points are shifted, and variances, which add to theirs: n times, as all of n that are seen
+    at once may be off alike.
+    """
+    half = np.flatnonzero((rows >= 0) & (np.asarray(event.kinds) != POINT))
+    if state.errors is None or not len(half):
+        return event
+    directions, lines = np.asarray(event.directions)[half], event.lines_of_sight[half]
+    basis = directions_of(lines)
+    P = basis @ _apart(state, rows[half]) @ transpose(basis)
+    with_along, across = P[:, 0, 1:], P[:, 1:, 1:]
+    variances_across = np.diagonal(across, axis1=1, axis2=2)
+    r = np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), LEAST_M)
+    means = np.hstack([variances_across.sum(axis=1, keepdims=True) / 2.0, -with_along]) / r
+    of_range = np.sum(across**2, axis=(1, 2))[:, None] / 2.0
+    of_directions = P[:, :1, 0] * variances_across + with_along**2
+    variances = len(half) * np.hstack([of_range, of_directions]) / r**2
+    points, covariances = event.points.copy(), np.array(event.covariances)
+    points[half] -= np.einsum('mij,mi->mj', directions, means)
+    covariances[half] += transpose(directions) @ (variances[:, :, None] * directions)
+    return replace(event, points=points, covariances=covariances)
+
+
+def _apart(state: State, rows: IntArray) -> FloatArray:
+    """Return how uncertain it is where landmarks ``rows`` are from the robot (m, 3, 3), body."""
+    errors, (p, k) = state.known_errors, (state.axes.p, state.axes.point)
+    # However the robot is turned: about itself that moves nothing.
+    to_robot = state.axes.output_matrix(state.observer.A[None, :3, 3])[0]
+    joint, full = errors.joint_covariance(rows), np.zeros((len(rows), 3, 3))
+    P = errors.joint.pose if joint is None else joint[:p, :p]
+    full[:, :k, :k] = to_robot @ P @ to_robot.T
+    if joint is not None:
+        with_robot = (to_robot @ joint[:p, p:]).reshape(k, -1, k).swapaxes(0, 1)
+        own = diagonal_blocks(joint[p:, p:], k)
+        full[:, :k, :k] += own - with_robot - transpose(with_robot)
     R = state.observer.A[:3, :3]
     turned: FloatArray = R.T @ full @ R
     return turned

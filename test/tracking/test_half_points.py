@@ -140,6 +140,22 @@ def test_degrees_of_freedom_are_those_that_were_measured():
         assert np.abs(innovation.log_densities).max() < 10.0
 
 
+@pytest.mark.parametrize('kind', [RANGE, BEARING])
+def test_a_start_known_to_metres_is_honest_although_half_points_are_not_linear(kind):
+    nees = []
+    for seed in range(8):
+        world = World(SETTINGS, seed=seed)
+        sigmas = np.array([0.0, 0.0, 0.3, 2.0, 2.0, 0.0])
+        start = world.A @ se3.exp(sigmas * world.rng.normal(size=6))
+        world.estimator.load_map(world.estimator.loaded_maps[0], start, np.diag(sigmas**2))
+        for _ in range(20):
+            world.drive(0.1, [kind], rows=(0, 1, 2))
+            off = (world.estimator.pose - world.A)[:2, 3]
+            P = world.estimator.pose_covariance[3:5, 3:5]
+            nees.append(off @ np.linalg.solve(P, off) / 2.0)
+    assert 0.5 < np.mean(nees) < 2.0
+
+
 def test_bearings_show_how_noisy_the_motion_is_as_points_do():
     stated = (0.0, 0.0, 0.005)
     settings = replace(SETTINGS, motion_noise_factor='auto', angular_velocity_noise=stated)
