@@ -11,6 +11,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -264,6 +265,12 @@ class Ambiguity:
     def lasts_ns(self) -> int:
         """How long it has lasted, nanoseconds."""
         return self.until_ns - self.since_ns
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """What the finding ``ambiguous_map`` says of it: seconds, and metres in the world."""
+        x, y, _ = self.position.tolist()
+        return {'lasts_s': to_s(self.lasts_ns), 'x': x, 'y': y, 'probability': self.probability}
 
 
 @dataclass(frozen=True, slots=True)

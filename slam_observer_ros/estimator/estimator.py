@@ -413,15 +413,18 @@ class Estimator(Estimate):
                 self._localiser.doubt_strayed(self._state, update)
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
-            self._find_doubled(event.stamp_ns)
+            self._judge_map(event.stamp_ns)
         distance_m = math.hypot(*self._state.observer.A[:3, 3].tolist())
         has_diverged = not distance_m <= DIVERGED_M  # or it is no number
         if has_diverged:
             self._start_again(distance_m)
         return bool(self._localiser.maps) or some_are_unknown or has_diverged
 
-    def _find_doubled(self, stamp_ns: int) -> None:
-        """Take landmarks without ids for one that turn out to be, after an observation."""
+    def _judge_map(self, stamp_ns: int) -> None:
+        """Say that another map is shown from now on, and take landmarks for one that are."""
+        wrong = self.longest_ambiguity
+        if wrong is not None and wrong.until_ns == stamp_ns and self.ambiguity is None:
+            self._warnings.warn('ambiguous_map', '', **wrong.figures)
         closure = self._loop_closure
         closure.note(self._state, stamp_ns)
         if closure.is_due(self._state, stamp_ns):

@@ -169,9 +169,7 @@ def of_map_without_ids(estimator: Estimate, ambiguity: Ambiguity | None) -> list
     """Judge whether what was seen without ids makes one map, and makes one at all."""
     findings, known, waiting = [], len(estimator.landmark_ids), estimator.waiting_landmarks
     if ambiguity is not None:
-        x, y, _ = ambiguity.position
-        lasts_s, probability = to_s(ambiguity.lasts_ns), ambiguity.probability
-        findings.append(found('ambiguous_map', lasts_s=lasts_s, x=x, y=y, probability=probability))
+        findings.append(found('ambiguous_map', **ambiguity.figures))
     # After twice as many observations as one landmark takes.
     is_begun = estimator.counts['observation'] >= 2 * estimator.settings.confirmations
     is_hardly_any = is_begun and known < HARDLY_ANY * waiting

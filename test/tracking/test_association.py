@@ -183,7 +183,7 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     assert_allclose(estimator.world_points, posts, atol=0.1)
 
 
-def test_it_says_since_when_and_where_what_is_seen_fits_several_maps():
+def test_it_says_since_when_and_where_what_is_seen_fits_several_maps(caplog):
     """Of two posts 3 m apart one is in view for ten seconds, then a third landmark decides."""
     settings = replace(PLANAR, angular_velocity_noise=(0.0, 0.0, 0.1), confirmations=1)
     posts = np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 6.0, 0.0]])
@@ -216,6 +216,7 @@ def test_it_says_since_when_and_where_what_is_seen_fits_several_maps():
     assert longest.since_ns <= ambiguity.since_ns, 'when the other one parted from it'
     assert longest.until_ns == 20 * 10**9, 'when the other one was shown in its place'
     assert longest.probability < 0.1
+    assert 'fits several maps for 10 s' in caplog.text, 'which is said where nobody looks, too'
 
 
 def test_it_says_that_landmarks_are_seen_too_seldom_for_a_map():
