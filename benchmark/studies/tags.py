@@ -27,7 +27,7 @@ from slam_observer_ros.lie import so3
 from slam_observer_ros.models.calibration import without_calibration
 from slam_observer_ros.runs.metrics import ConfigurationError
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking.tags import flipped
+from slam_observer_ros.tracking.matching import flipped
 
 MAX_SEEN = (1, 2, 5)
 SIGMAS_RAD = (0.02, 0.05, 0.15)

@@ -410,7 +410,8 @@ class Estimator(Estimate):
                 and self._hypotheses.judge_views(loaded.ids, loaded.covariances)
             ):
                 self._timeline.velocities.doubt_standing()
-                self._localiser.doubt_strayed(self._state, update)
+                shows_turn = event.orientations is not None
+                self._localiser.doubt_strayed(self._state, update, shows_turn)
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
             self._judge_map(event.stamp_ns)

@@ -110,6 +110,9 @@ class TagGains(Protocol):
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Move the state by known orientations; return weights (m,), and which are unclear."""
 
+    def clear_turns(self, seen: SeenOrientations) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return φ_i (m, q), their noise (m, q, q), and which (m,) are not of flipped twins."""
+
     def add_orientations(self, seen: SeenOrientations) -> None:
         """Take over orientations as they are seen, where none is known yet."""
 

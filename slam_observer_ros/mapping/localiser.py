@@ -138,11 +138,11 @@ class Localiser:
         """Whether what is seen of a map contradicts the pose, at once or view by view."""
         return self._contradiction.lasts or self._contradiction.is_doubted
 
-    def doubt_strayed(self, state: State, update: Update) -> None:
+    def doubt_strayed(self, state: State, update: Update, shows_turn: bool) -> None:
         """Doubt a pose which the last views contradict together, if they do not find it either."""
         if len(update.ids) < state.axes.point:
             self.counts['contradicted_pose'] += not self.is_contradicted
-            self._contradiction.doubted_until_ns = update.stamp_ns + STRAYED_NS
+            self._contradiction.doubt(update.stamp_ns, shows_turn)
 
     def may_be_rough(self, event: ObservationEvent) -> bool:
         """Return whether points without ids are to be matched by a pose just given."""
@@ -186,8 +186,7 @@ class Localiser:
         """Return whether enough of a map that does not change says so, one after the other."""
         if not self.is_localised or state.is_mapping:
             return False
-        if np.count_nonzero(~update.rejected) >= state.axes.point:
-            self._contradiction.doubted_until_ns = 0
+        self._contradiction.confirm(update.ids[~update.rejected].tolist(), state.axes.point)
         if self._contradiction.begins(update):
             self.counts['contradicted_pose'] += 1
             logger.warning('%s', found('contradicted_pose'))
@@ -409,12 +408,30 @@ class Contradiction:
     def __init__(self) -> None:
         self._moved: set[int] = set()
         self._rejected: set[int] = set()  # since any was accepted
-        self._times = self._since_ns = self._last_ns = self.doubted_until_ns = 0
+        self._times = self._since_ns = self._last_ns = self._doubted_until_ns = 0
+        self._is_ambiguous, self._confirming = False, set[int]()
+
+    def doubt(self, stamp_ns: int, shows_turn: bool) -> None:
+        """Doubt the pose, as few landmarks contradict it.
+
+        By one point alone the robot may be anywhere around it, once it was moved: if it
+        contradicts the pose again, the doubt lasts until others are where they should be. A tag
+        that ``shows_turn`` finds the pose.
+        """
+        self._is_ambiguous = self._is_ambiguous or (self.is_doubted and not shows_turn)
+        self._doubted_until_ns, self._confirming = stamp_ns + STRAYED_NS, set()
+
+    def confirm(self, ids: list[int], needed: int) -> None:
+        """Doubt it no more once so many landmarks were accepted since, ``ids`` just now."""
+        self._confirming.update(ids)
+        if len(self._confirming) >= needed:
+            self._is_ambiguous, self._doubted_until_ns, self._confirming = False, 0, set()
 
     @property
     def is_doubted(self) -> bool:
         """Whether it was contradicted by few landmarks lately, and nothing has confirmed it."""
-        return 0 < self.doubted_until_ns - self._last_ns <= STRAYED_NS
+        lately = 0 < self._doubted_until_ns - self._last_ns <= STRAYED_NS
+        return lately or self._is_ambiguous
 
     @property
     def lasts(self) -> bool:

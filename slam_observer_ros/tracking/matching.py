@@ -11,11 +11,14 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.lie import se3
 from slam_observer_ros.models import sensing
 from slam_observer_ros.models.point_noise import RESOLUTION_M
 from slam_observer_ros.tracking.state import State
+
+_NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
 
 SAME_POSITION = 4.0
 """Rejections within this many standard deviations of each other are at one position."""
@@ -151,3 +154,39 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     if np.count_nonzero(is_sure) < len(rows):
         points = np.where(is_sure[:, None], points, event.points)
     return points if event.sensor is None else points - event.sensor
+
+
+def flipped(Z: FloatArray, lines_of_sight: FloatArray) -> FloatArray:
+    """Return the other orientations (m, 3, 3) in which tags look nearly the same.
+
+    Mirrored in depth, a plane's image is the same but for perspective; so they are hard to
+    distinguish for tags that are small or nearly frontal. A tag is in its x-y plane.
+    """
+    squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)[:, None, None]
+    outer = lines_of_sight[:, :, None] * lines_of_sight[:, None, :]
+    mirror = np.eye(3) - 2.0 * outer / np.maximum(squared, np.finfo(np.float64).tiny)
+    twins: FloatArray = mirror @ Z @ _NORMAL_TURNED
+    return twins
+
+
+def all_orientations(
+    state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray
+) -> SeenOrientations:
+    """Return the orientations ``Z`` (m, 3, 3) in an observation, with their noise."""
+    noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
+    unseen_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    repeated = state.observation_noise.repetitions(unseen_s)
+    twins, D = flipped(Z, event.lines_of_sight), sensing.turn_sensitivity(state.calibration, event)
+    if D is not None:
+        D = state.observer.A[:3, :3] @ D
+    return SeenOrientations(rows, Z, twins, noise, repeated, D)
+
+
+def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:
+    """Return the orientations (m, 3, 3) expected of tags; of an unknown one, as it is seen.
+
+    By the seen orientation, a tag that only seems to be tilted would be trusted too much.
+    """
+    tags = state.observer.orientations
+    expected: FloatArray = state.observer.A[:3, :3].T @ tags.B[rows]
+    return np.where(tags.are_known[rows][:, None, None], expected, Z)

@@ -39,7 +39,12 @@ from slam_observer_ros.models.held_velocities import HeldVelocities
 from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.models.point_noise import repetition_factors
 from slam_observer_ros.models.velocity_history import VelocityHistory
-from slam_observer_ros.tracking.matching import is_contradiction, match, MatchedObservation
+from slam_observer_ros.tracking.matching import (
+    all_orientations,
+    is_contradiction,
+    match,
+    MatchedObservation,
+)
 from slam_observer_ros.tracking.state import State
 
 MAX_DURATION_S = 4.0
@@ -97,11 +102,13 @@ UNSEEN_NS = to_ns(1.0)
 WINDOWS_S = np.array([0.3, 1.0, 3.0])
 """Times, seconds, after which a view counts for a third: a robot may be pushed fast or slowly."""
 
-UNLIKELY = {3: 36.0, 6: 44.0}
+UNLIKELY, UNLIKELY_ALONE = {3: 36.0, 6: 44.0}, {3: 25.0, 6: 32.0}
 """χ² of p axes beyond which views contradict a pose that is surer than they are.
 
-Of honest noise one in ten million is. Noise twice as large as stated, or a map taken as exact,
-exceed them more often; that costs little, as the pose only becomes less sure.
+Of honest noise one in ten million is; one in a hundred thousand of a point alone in view, by which
+a robot that is pushed aside seems to turn, unless it stands, when errors last. Noise twice as
+large as stated, or a map taken as exact, exceed them more often; that costs little, as the pose
+only becomes less sure.
 """
 
 STRAYED = 144.0
@@ -555,6 +562,9 @@ class MapViews:
     from one view to the next, m is about L δ, with L = Σ λ G. R is the noise while driving: to
     what lasts while the robot stands, its pose has adapted.
 
+    How tags are turned, φ_i = Ω + noise, says what a shift hides. Of one point alone nothing does:
+    a turn by which views have corrected the pose may have been a shift.
+
     Landmarks ``ids`` (n,) are in the map, with ``covariances`` (n, 3, 3), m², or None if it is
     exact.
     """
@@ -569,6 +579,8 @@ class MapViews:
     def _begin(self) -> None:
         w, p = len(WINDOWS_S), self._axes.p
         self._m, self._M, self._L = np.zeros((w, p)), np.zeros((w, p, p)), np.zeros((w, p, p))
+        self._is_alone = False
+        self._c, self._W = np.zeros((w, p)), np.zeros((p, p))
 
     def add(self, state: State, event: ObservationEvent) -> None:
         """Take in an observation that is yet to be used."""
@@ -576,12 +588,14 @@ class MapViews:
         if event.kinds is not None or not in_map.any():
             return
         seen = in_map.any(axis=1)
-        residuals, in_map = match(state, event.select(seen)).residuals, in_map[seen]
+        matched, in_map = match(state, event.select(seen)), in_map[seen]
+        residuals = matched.residuals
         if len(residuals.rows) < len(in_map):
             return
         axes, lasting_s = self._axes, state.settings.observation_correlation_time
         r, noise = residuals.on(axes)
-        noise = noise * repetition_factors(residuals.dt_s, lasting_s)[:, None, None]
+        repeated = repetition_factors(residuals.dt_s, lasting_s)[:, None, None]
+        noise = noise * repeated
         if self._covariances is not None:
             turn = state.observer.reference_pose[: axes.point, : axes.point]
             of_map = self._covariances[in_map.argmax(axis=1), : axes.point, : axes.point]
@@ -592,22 +606,32 @@ class MapViews:
         to_place = self._moved(-place)
         P = to_place @ state.known_errors.joint.pose @ to_place.T
         far = mahalanobis(r, noise + C @ P @ transpose(C))
-        passed = accepted(far, state.settings.rejection_threshold)
+        gate = state.settings.rejection_threshold
+        passed = accepted(far, gate)
         if is_contradiction(~passed):
             return
         # No view of one landmark says more than a few: it may be an outlier.
         r = passed[:, None] * np.minimum(1.0, CLEAR / np.maximum(far, CLEAR))[:, None] * r
         CW = passed[:, None, None] * transpose(solve_symmetric(noise, C))
         W, w = np.sum(CW @ C, axis=0), np.sum(CW @ r[:, :, None], axis=0)
+        stands = state.observation_noise.stood_s > 0.0
+        self._is_alone = len(r) < axes.point and event.orientations is None and not stands
+        if event.orientations is not None:
+            W_turns, w_turns = _by_turns(state, matched, passed, repeated, P)
+            W[: axes.turn, : axes.turn] += W_turns
+            w[: axes.turn, 0] += w_turns
         said = np.linalg.solve(np.eye(axes.p) + W @ P, np.column_stack([w, W]))
         # What was said of the pose where the robot was, is said of it where it is.
-        there, self._place = self._moved(place - self._place), place
+        there, back = self._moved(place - self._place), self._moved(self._place - place)
+        self._place = place
         elapsed_s = to_s(max(event.stamp_ns - self._stamp_ns, 0))
         self._stamp_ns = event.stamp_ns
         share = np.exp(-elapsed_s / WINDOWS_S)[:, None, None]
         self._m = share[:, 0] * (self._m @ there) + said[:, 0]
         self._M = share**2 * (there.T @ self._M @ there) + said[:, 1:]
         self._L = share * (there.T @ self._L @ there) + said[:, 1:]
+        self._W = share[0] * (there.T @ self._W @ there) + W
+        self._c = share[:, 0] * (self._c @ back.T) + P @ said[:, 0]
 
     def _moved(self, shift: FloatArray) -> FloatArray:
         """Return which error (p, p) about a point is one about the point ``shift`` (3,) on."""
@@ -626,12 +650,14 @@ class MapViews:
         M = M / (scales[:, :, None] * scales[:, None]) + 1e-9 * np.eye(m.shape[1])
         squares = np.sum(m * np.linalg.solve(M, m), axis=(1, 2))
         window = int(np.argmax(squares))
-        if squares[window] <= UNLIKELY[self._axes.p]:
+        unlikely = UNLIKELY_ALONE if self._is_alone else UNLIKELY
+        if squares[window] <= unlikely[self._axes.p]:
             return None
         is_first = self._stamp_ns - self._contradicted_ns > to_ns(WINDOWS_S[-1])
         earlier, self._contradicted_ns = 0.0 if is_first else self._sum, self._stamp_ns
         self._sum = earlier + float(squares[window])
         full = _explained(state, self._m[window], self._L[window])
+        full += _instead_of_turn(self._axes, self._c[window], self._W)
         explained = self._axes.full_pose_covariance(full)
         self._begin()
         turn = block_diag(state.observer.A[:3, :3], state.observer.A[:3, :3])
@@ -653,3 +679,42 @@ def _explained(state: State, m: FloatArray, L: FloatArray) -> FloatArray:
         known = np.sum(1.0 - np.diagonal(covariance) / (taken_s * unknown))
         taken_s = max(float(np.sum(delta**2 / unknown) / known), MIN_VARIANCE)
     return np.outer(delta, delta) + covariance
+
+
+def _by_turns(
+    state: State,
+    matched: MatchedObservation,
+    passed: BoolArray,
+    repeated: FloatArray,
+    P: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return Σ R⁻¹ (q, q) and Σ R⁻¹ φ (q,) of how tags are turned whose points ``passed`` (m,).
+
+    ``repeated`` (m, 1, 1) is by what their errors last, and P (p, p) of the pose.
+    """
+    tags, of_all, q = state.gains.tags, state.observer.orientations, state.axes.turn
+    event, rows = matched.known, matched.residuals.rows
+    if tags is None or event.orientations is None:
+        return np.zeros((q, q)), np.zeros(q)
+    seen = all_orientations(state, event, rows, event.orientations)
+    known = passed & of_all.are_known[seen.rows] & seen.Z.any(axis=(1, 2))
+    seen = seen.select(known)
+    phi, noise, clear = tags.clear_turns(seen)
+    noise = noise * repeated[known]
+    noise += of_all.map_sigmas[seen.rows, None, None] ** 2 * np.eye(q)
+    far = mahalanobis(phi, noise + P[:q, :q])
+    used = clear & accepted(far, state.settings.rejection_threshold)
+    weights = np.linalg.inv(noise[used])
+    return np.sum(weights, axis=0), np.einsum('ijk,ik->j', weights, phi[used])
+
+
+def _instead_of_turn(axes: EstimatedAxes, c: FloatArray, W: FloatArray) -> FloatArray:
+    """Return e eᵀ (p, p) of the error e if what corrections ``c`` (p,) turned was shifted instead.
+
+    As likely as what the views say together, ``W`` (p, p): one point is seen the same way.
+    """
+    q = axes.p - axes.point
+    shift = np.linalg.lstsq(W[q:, q:], W[q:, :q] @ c[:q], rcond=None)[0]
+    error = np.concatenate([c[:q], -shift])
+    share: float = math.exp(-0.5 * max(error @ W @ error, 0.0))
+    return share * np.outer(error, error)

@@ -13,7 +13,7 @@ from strategies import generators
 from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.tracking.tags import flipped
+from slam_observer_ros.tracking.matching import flipped
 
 TAGS = replace(PLAIN, use_tag_orientation=True)
 PLANAR_TAGS = replace(TAGS, two_d_mode=True)

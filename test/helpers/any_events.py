@@ -24,7 +24,7 @@ from slam_observer_ros.lie.matrices import are_covariances, diagonal_blocks
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import Parameter, table, Value
-from slam_observer_ros.tracking.tags import flipped
+from slam_observer_ros.tracking.matching import flipped
 
 ROWS = table(Settings)
 

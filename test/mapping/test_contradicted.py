@@ -160,6 +160,7 @@ SIDEWAYS, BACK = np.eye(6)[4], np.eye(6)[3] * -1.0
         pytest.param(0.15 * np.eye(6)[3], STANDS, [0, 1, 2], id='wheels spin slowly'),
         pytest.param(0.15 * np.eye(6)[3], STANDS, [0], id='wheels spin slowly, one in view'),
         pytest.param(STANDS, 0.3 * BACK, [0], id='pushed back, one in view'),
+        pytest.param(STANDS, 0.3 * SIDEWAYS, [0], id='pushed aside, one in view'),
         pytest.param(0.5 * np.eye(6)[3], STANDS, [0], id='wheels spin, one in view'),
         pytest.param(ON_THE_SPOT, STANDS, [0, 1, 2], id='wheels turn on the spot'),
         pytest.param(ON_THE_SPOT, STANDS, [0], id='wheels turn on the spot, one in view'),
@@ -179,6 +180,20 @@ def test_a_robot_is_not_surely_elsewhere_for_longer_than_a_second(odometry, true
     robot.run(3.0, [0, 1, 2, 3], STANDS, STANDS)
     assert not robot.said[-1]
     assert np.linalg.norm(robot.estimator.pose[:3, 3] - robot.A[:3, 3]) < 0.1
+
+
+@pytest.mark.parametrize('tags', [False, True], ids=['point', 'tag'])
+def test_a_point_alone_does_not_end_the_doubt_of_where_a_push_has_led_but_a_tag_does(tags):
+    robot = Robot('uncertain', tags, planar=True)
+    robot.run(3.0, [0, 1, 2, 3])
+    robot.run(5.0, [0], STANDS, STANDS)
+    robot.run(3.0, [0], 0.3 * SIDEWAYS, STANDS)
+    robot.run(10.0, [0], STANDS, STANDS)
+    assert robot.said[-1] == (not tags)
+    off_m = np.linalg.norm(robot.estimator.pose[:3, 3] - robot.A[:3, 3])
+    assert robot.said[-1] or off_m < 0.2
+    robot.run(0.2, [1], STANDS, STANDS)  # and where another one is, it shows where the robot is
+    assert not robot.said[-1]
 
 
 @pytest.mark.parametrize('size', [1e-300, 1e-12, 1.0, 1e12])

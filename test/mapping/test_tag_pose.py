@@ -13,7 +13,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking.tags import flipped
+from slam_observer_ros.tracking.matching import flipped
 
 SIGMA_M, SIGMA_RAD = 0.02, 0.03
 SETTINGS = Settings(

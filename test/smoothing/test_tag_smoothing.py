@@ -20,7 +20,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
 from slam_observer_ros.smoothing.keyframes import no_keyframes, SeenTurns, Solution
 from slam_observer_ros.smoothing.observations import Observations
-from slam_observer_ros.tracking.tags import flipped
+from slam_observer_ros.tracking.matching import flipped
 
 SIGMA_RAD, SIGMA_M = 0.05, 0.05
 TURN_NOISE, SPEED_NOISE = 0.1, 0.1  # rad/√s, m/√s

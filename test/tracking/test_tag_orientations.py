@@ -12,7 +12,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking.tags import flipped
+from slam_observer_ros.tracking.matching import flipped
 
 TAG = np.array([3.0, 0.0, 0.0])
 FACING = so3.exp(np.array([0.0, -np.pi / 2 + 0.4, 0.0]))  # a tag's z axis is its normal

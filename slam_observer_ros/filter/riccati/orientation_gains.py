@@ -69,11 +69,8 @@ class OrientationGains(Errors, Gains):
         Return the weight (m,) of each, and which are left out: those whose flipped twins are
         likely, too.
         """
-        phi, R = self._turns(seen.rows, seen.Z), self._noise(seen.covariances)
-        _, predicted = self.joint.project_turns(seen.rows, seen.D)
-        # Which of the two that look alike it is; a gate; then Huber's weights.
-        are_flipped, are_unclear = self._judge_flips(seen, phi, predicted, R)
-        kept = ~(are_flipped | are_unclear)
+        phi, R, predicted, kept, are_unclear = self._judged_turns(seen)
+        # A gate; then Huber's weights.
         entries = np.flatnonzero(np.repeat(kept, phi.shape[1]))
         weights = np.zeros(len(phi))
         weights[kept] = gated_weights(
@@ -86,6 +83,21 @@ class OrientationGains(Errors, Gains):
             S = with_blocks(HPH, R[used] * (seen.repeated[used] / weights[used])[:, None, None])
             self._move(-self.joint.update(HP, S, phi[used].ravel()))
         return weights, are_unclear
+
+    def clear_turns(self, seen: SeenOrientations) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return φ_i (m, q), their noise (m, q, q), and which (m,) are not of flipped twins."""
+        phi, R, _, kept, _ = self._judged_turns(seen)
+        return phi, R, kept
+
+    def _judged_turns(
+        self, seen: SeenOrientations
+    ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, BoolArray]:
+        """Return φ_i (m, q), their noise, what P predicts, which are clear, and which unclear."""
+        phi, R = self._turns(seen.rows, seen.Z), self._noise(seen.covariances)
+        _, predicted = self.joint.project_turns(seen.rows, seen.D)
+        # Which of the two that look alike it is.
+        are_flipped, are_unclear = self._judge_flips(seen, phi, predicted, R)
+        return phi, R, predicted, ~(are_flipped | are_unclear), are_unclear
 
     def add_orientations(self, seen: SeenOrientations) -> None:
         """Take over orientations as they are seen, where none is known."""
