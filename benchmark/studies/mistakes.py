@@ -5,11 +5,14 @@ the sample and simulated drives, and says in how many of them it is named; then 
 the runs as they are, with outliers, slips, and with noise that is stated wrongly. ``--map`` gives
 the surveyed map. Each recording is printed as it is judged; with ``--results FILE`` it is kept
 there, and is not judged again: so parts (``--only``) that run by themselves make one table.
+``--live`` gives the events to what a node looks with, as fast as they came, and says after how
+much driving it names what, in the first two minutes of driving.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 import json
@@ -19,6 +22,7 @@ from pathlib import Path
 import sys
 import time
 from typing import Any, TypeAlias
+from unittest.mock import Mock, patch
 
 import _above  # noqa: F401 (finds the modules of the folder above)
 import numpy as np
@@ -28,11 +32,15 @@ from threadpoolctl import threadpool_limits
 import worlds
 from worlds import World
 
+from slam_observer_ros.common.findings import explained
+from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.trajectory import LandmarkTruth
-from slam_observer_ros.runs.mistakes import ALIKE, Correction, mistakes, OPTICAL
+from slam_observer_ros.runs.health import NoiseFit, of_all_learnt, of_node, Progress
+from slam_observer_ros.runs.mistakes import ALIKE, Correction, Drive, mistakes, OPTICAL, Search
 from slam_observer_ros.settings.estimator_settings import Settings
 
 MADE = {
@@ -66,6 +74,9 @@ DRIVES = 20
 """Simulated ones. Who works on thresholds looks at the first half of them alone."""
 
 SURVEY_M = 0.01
+LIVE_S = 120.0
+"""Driving after which no more is looked for live."""
+
 Key: TypeAlias = tuple[str, str]  # a world, and what is made of it
 
 
@@ -75,6 +86,7 @@ def main() -> None:
     parser.add_argument('--map', action='store_true', help='the robot is in the surveyed map')
     parser.add_argument('--only', default='', metavar='NAME', help='worlds whose name has NAME')
     parser.add_argument('--results', type=Path, metavar='FILE', help='where to keep each row')
+    parser.add_argument('--live', action='store_true', help='look as a node does')
     parser.add_argument('--table', action='store_true', help='judge nothing: only print')
     args = parser.parse_args()
     threadpool_limits(1)
@@ -98,9 +110,12 @@ def main() -> None:
         for made, (settings, events) in recordings(world).items():
             if (name, made) in found:
                 continue
-            start_s = time.process_time()
-            named = [each.kind for each in mistakes(settings, events, known)]
-            taken_s = time.process_time() - start_s
+            if args.live:
+                named, taken_s = named_live(settings, events, known)
+            else:
+                start_s = time.process_time()
+                named = [each.kind for each in mistakes(settings, events, known)]
+                taken_s = time.process_time() - start_s
             row = {'world': name, 'map': args.map, 'made': made, 'named': named}
             row['seconds'] = round(taken_s, 2)
             note(row)
@@ -109,15 +124,58 @@ def main() -> None:
                     file.write(json.dumps(row) + '\n')
             sys.stdout.write(f'{name:20} {made:46} {taken_s:5.1f} s: {", ".join(named) or "-"}\n')
             sys.stdout.flush()
-    print_table(found, seconds)
+    print_table(found, seconds, 's of driving' if args.live else 's of CPU')
 
 
-def print_table(found: Mapping[Key, Sequence[str]], seconds: Mapping[Key, float]) -> None:
+def named_live(
+    settings: Settings, events: Iterable[Event], known: LandmarkMap | None
+) -> tuple[list[str], float]:
+    """Return what a node names first, and after how much driving, in seconds."""
+    from slam_observer_ros.nodes import diagnostics  # which needs ROS
+
+    noise, drive, node = NoiseFit(), Drive(), Mock()
+    estimator = Estimator(settings, on_update=noise.add, judges_innovations=True)
+    if known is not None:
+        estimator.load_map(known)
+    lately: deque[Counter[str]] = deque(maxlen=diagnostics.RECENT)
+    before: Counter[str] = Counter()
+    with patch.object(diagnostics, 'time') as clock:
+        clock.monotonic.return_value = now_s = 0.0
+        watch = diagnostics.MistakeWatch(node, estimator, Search)
+        advance, timer = node.create_steady_timer.call_args.args[1], node.create_steady_timer()
+        first_ns = None
+        for event in events:
+            first_ns = event.stamp_ns if first_ns is None else first_ns
+            while now_s < to_s(event.stamp_ns - first_ns):
+                last_s, now_s = now_s, now_s + diagnostics.PERIOD_S
+                clock.monotonic.return_value = now_s
+                if timer.reset.call_count >= timer.cancel.call_count:  # as it begins cancelled
+                    advance()
+                if int(now_s) == int(last_s):
+                    continue
+                new = estimator.counts - before
+                before = estimator.counts.copy()
+                lately.append(new)
+                counted = sum(lately, Counter[str]())
+                progress = Progress(Counter(), new, Counter(), counted, False, has_seen=True)
+                symptoms = explained([*of_node(estimator, [], progress), *noise.findings])
+                watch.look([*symptoms, *of_all_learnt(estimator)], has_slipped=new['slip'] > 0)
+            if watch.findings or drive.driven_s > LIVE_S:
+                break
+            watch.note(event)
+            estimator.add(event)
+            drive.add(event)
+    return [each.kind for each in watch.findings], drive.driven_s
+
+
+def print_table(
+    found: Mapping[Key, Sequence[str]], seconds: Mapping[Key, float], unit: str
+) -> None:
     """Print how often each mistake is named, with none beside it that was not made."""
     for made in dict.fromkeys(made for _, made in found):
         named = {world: set(kinds) for (world, what), kinds in found.items() if what == made}
         taken_s = [value for (_, what), value in seconds.items() if what == made]
-        longest = f'{np.median(taken_s):4.1f} s of CPU, at most {max(taken_s):4.1f} s'
+        longest = f'{np.median(taken_s):4.1f} {unit}, at most {max(taken_s):4.1f}'
         wrong = {
             world: ' + '.join(sorted(kinds)) or 'nothing'
             for world, kinds in named.items()
