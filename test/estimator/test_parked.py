@@ -199,6 +199,18 @@ def test_a_gyroscope_beside_the_wheels_learns_its_bias_while_they_stand(changes)
         assert (np.abs(off) < 4.0 * deviations).all()
 
 
+def test_a_gyroscope_beside_wheels_that_stand_since_start_up_shows_its_bias_before_any_drive():
+    robot, bias = Robot(), np.array([-0.006, 0.008, -0.02])
+    robot.run(20.0, [], np.zeros(6), bias=bias)
+    found = [part for part in robot.estimator.calibration if 'angular_bias' in part.name]
+    off = np.array([part.value for part in found]) - bias
+    deviations = np.array([part.deviation for part in found])
+    assert (deviations < 5e-4).all()
+    assert (np.abs(off) < 4.0 * deviations).all()
+    turned_rad = np.linalg.norm(so3.log(robot.estimator.pose[:3, :3]))
+    assert turned_rad < 0.05  # of 0.45 by the gyroscope alone
+
+
 @pytest.mark.parametrize(('rate', 'stands'), [(0.5 * TURNS, True), (2.0 * TURNS, False)])
 def test_wheels_that_stand_overrule_the_bias_of_a_gyroscope_but_not_a_turn(rate, stands):
     history, turns = VelocityHistory(SECOND), np.array([0.0, 0.0, rate])
