@@ -17,7 +17,7 @@ from :data:`MAX_UNKNOWNS` on they are not relinearised, either.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 import logging
@@ -152,7 +152,7 @@ class Past:
         """Return the poses (4, 4) of marked observations; None where that is not known."""
         return [None for _ in marks]
 
-    def placed(self, point: FloatArray, seen: Keyframe) -> Placed | None:
+    def placed(self, points: FloatArray, seen: Sequence[Keyframe]) -> Placed | None:
         """Return where a landmark is that was ``seen`` in marked observations, near a point (3,).
 
         By all that was seen since the summary. None where that is not kept, or leaves it open.
@@ -289,31 +289,36 @@ class Relinearisation(Past):
         history = self.history
         return [None if at < 0 else history.poses[at + 1] for at in history.marked(marks)]
 
-    def placed(self, point: FloatArray, seen: Keyframe) -> Placed | None:
+    def placed(self, points: FloatArray, seen: Sequence[Keyframe]) -> Placed | None:
         """Return where a landmark is that was ``seen`` in marked observations, near a point (3,).
 
-        By all that was seen since the summary. None where that is not kept, or leaves it open.
+        By all that was seen since the summary; others (m, 3) that wait as well may follow it. None
+        where that is not kept, or leaves it open.
         """
         history, first = self.history, self.history.summarised
-        numbers = np.array(history.marked(seen.marks))
-        if not (self.is_active and self._is_dense) or numbers.min() < first:
+        marked = [np.array(history.marked(each.marks)) for each in seen]
+        if not (self.is_active and self._is_dense) or marked[0].min() < first:
             return None
         solution = self._solution_from(first)
-        row = len(solution.points)
-        views = history.as_seen(seen._replace(rows=np.full(len(numbers), row)), numbers - first)
+        row, keyframes = len(solution.points), history.latest_keyframes()
+        kept = [i for i, numbers in enumerate(marked) if numbers.min() >= first]
+        for at, i in enumerate(kept, row):
+            rows = np.full(len(marked[i]), at)
+            views = history.as_seen(seen[i]._replace(rows=rows), marked[i] - first)
+            keyframes = keyframes.with_more(views)
         solution = replace(
             solution,
-            points=np.concatenate([solution.points, point[None]]),
-            orientations=np.concatenate([solution.orientations, np.zeros((1, 3, 3))]),
+            points=np.concatenate([solution.points, points[kept]]),
+            orientations=np.concatenate([solution.orientations, np.zeros((len(kept), 3, 3))]),
         )
         try:
-            smoother = self._smoother(history.summary, history.latest_keyframes().with_more(views))
+            smoother = self._smoother(history.summary, keyframes)
             step, cost = smoother.descend(solution, PLACING_ITERATIONS, COST_TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             return None
         found = step.end.points[row]
-        if not _is_ahead(found, step.end.poses[numbers - first + 1], seen):
+        if not _is_ahead(found, step.end.poses[marked[0] - first + 1], seen[0]):
             return None  # another minimum
         (d, k), c = (self._axes.p, self._axes.point), self._calibration.count
         pose = step.end.poses[-1]

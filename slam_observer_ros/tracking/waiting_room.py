@@ -3,8 +3,9 @@
 k half measurements and the way between them are one point, seen now, with a covariance: by
 generalised least squares from starts all around, where the noise of the way is a random walk
 between the views. Where the past is kept, all that was seen since is linearised again at each of
-these places, and the views take the place of the point once it has entered. Two places that both
-fit, as on both sides of a straight way, are left open until a curve decides.
+these places, together with others that wait and are nearly sure, and the views take the place of
+the point once it has entered. Two places that both fit, as on both sides of a straight way, are
+left open until a curve decides.
 """
 
 from __future__ import annotations
@@ -51,6 +52,9 @@ to begin with: as it enters all is linearised again.
 In random halls half as much lets landmarks enter later, with errors a sixth larger; a quarter
 leaves some of them out.
 """
+
+LIKELY = 2.0
+"""Times as uncertain as sure a place may be that helps others to become sure."""
 
 FITS, APART = 2.5, 30.0
 """χ² per view of a solution that fits, and by how much more another one has that does not.
@@ -202,6 +206,7 @@ class WaitingRoom:
         self._observations = self._stamp_ns = 0
         self._has_new = False  # views, since all was remembered
         self._entered: dict[int, list[WaitingView]] = {}  # since then
+        self._likely: dict[int, FloatArray] = {}  # where some are (3,) that are not sure yet
         self.open_sides: set[int] = set()  # ids whose views fit two places
 
     def begin(self, stamp_ns: int) -> None:
@@ -232,7 +237,10 @@ class WaitingRoom:
         views.append(view)
         self._has_new = True
         seen = self._seen[landmark_id] = self._seen.get(landmark_id, 0) + 1
-        if len(views) < FEWEST_VIEWS or seen < self._next.get(landmark_id, 0):
+        if len(views) < FEWEST_VIEWS:
+            self._likely.pop(landmark_id, None)
+            return None
+        if seen < self._next.get(landmark_id, 0):
             return None
         self._next[landmark_id] = min(math.ceil(TRY_AGAIN * seen), seen + MOST_BETWEEN)
         poses = state.relinearisation.poses_of(each.number for each in views)
@@ -243,12 +251,23 @@ class WaitingRoom:
         problem = _PlaceProblem(now, self._way.covariance, state)
         found = problem.solve()
         self.open_sides.discard(landmark_id)
-        earlier = _as_seen(state, [each for each in views if each.number < self._observations])
-        place, has_rival = self._placed(state, problem, found, earlier)
+        self._likely.pop(landmark_id, None)
+        seen_all = [
+            _as_seen(state, [e for e in self._views[each] if e.number < self._observations])
+            for each in (landmark_id, *self._likely)
+        ]
+        place, has_rival = self._placed(state, problem, found, seen_all)
         if has_rival:
             self.open_sides.add(landmark_id)
-        if place is None or has_rival:
             return None
+        if place is None:
+            return None
+        if not problem.is_sure(place):
+            if problem.is_sure(place, LIKELY):
+                self._likely[landmark_id] = place.point
+            return None
+        for each in self._likely:
+            self._next[each] = 0
         self._entered[landmark_id] = list(views)
         for kept in (self._views, self._seen, self._next):
             del kept[landmark_id]
@@ -260,31 +279,40 @@ class WaitingRoom:
         return line / scale, turned @ of_point @ turned.T / scale**2
 
     def _placed(
-        self, state: State, problem: _PlaceProblem, found: list[Placed], seen: Keyframe
+        self,
+        state: State,
+        problem: _PlaceProblem,
+        found: list[Placed],
+        seen: list[Keyframe],
     ) -> tuple[Placed | None, bool]:
-        """Return which of the places ``found`` is sure, if any, and whether another fits, too.
+        """Return which of the places ``found`` is best, if any, and whether another fits, too.
 
         All that is known since of where the robot was says more than odometry alone.
         """
         if not found:
             return None, False
-        place, has_rival = found[0], any(_is_rival(each, found[0]) for each in found)
+        has_rival = any(_is_rival(each, found[0]) for each in found)
+        others = np.array(list(self._likely.values())).reshape(-1, 3)
         past = state.relinearisation
-        again = past.placed(place.point, seen)
-        if again is None:
-            return place if problem.is_sure(place) else None, has_rival
+
+        def placed(point: FloatArray) -> Placed | None:
+            return past.placed(np.concatenate([point[None], others]), seen)
+
+        place = placed(found[0].point)
+        if place is None:
+            return found[0], has_rival
         starts = [each.point for each in found[1:]]
         if problem.has_ranges:  # which fit on the other side of the way, too
-            starts.insert(0, problem.mirrored(again.point))
+            starts.insert(0, problem.mirrored(place.point))
         for point in starts:
-            if not problem.is_sure(again):
+            if not problem.is_sure(place, LIKELY):
                 return None, has_rival
-            other = past.placed(point, seen)
+            other = placed(point)
             if other is not None:
-                again, other = sorted((again, other), key=lambda each: each.cost)
-                if _is_rival(other, again):
+                place, other = sorted((place, other), key=lambda each: each.cost)
+                if _is_rival(other, place):
                     return None, True
-        return again if problem.is_sure(again) else None, False
+        return place, False
 
     def remember(self, states: Sequence[State]) -> bool:
         """Keep views, to be linearised again; return whether a landmark has entered."""
@@ -393,13 +421,13 @@ class _PlaceProblem:
                 places.append(each)
         return [self._with_scale(each) for each in places] if self._is_range.all() else places
 
-    def is_sure(self, place: Placed) -> bool:
+    def is_sure(self, place: Placed, times: float = 1.0) -> bool:
         """Return whether a place is known so well that all that was seen of it is linear."""
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(place.covariance)[-1]))
         distance_m = float(np.linalg.norm(place.point - self._origins, axis=1).min())
         # Far away the completion alone says where it is.
         sure = SURE_RANGES if self._is_range[-1] else SURE_BEARINGS
-        return sigma_m < sure * min(distance_m, 0.1 * UNMEASURED_M)
+        return sigma_m < times * sure * min(distance_m, 0.1 * UNMEASURED_M)
 
     def _with_scale(self, place: Placed) -> Placed:
         """Return a place whose covariance has the factor of the ranges in it."""
