@@ -585,7 +585,7 @@ class MapViews:
     def add(self, state: State, event: ObservationEvent) -> None:
         """Take in an observation that is yet to be used."""
         in_map = event.ids[:, None] == self._ids
-        if event.kinds is not None or not in_map.any():
+        if not in_map.any():
             return
         seen = in_map.any(axis=1)
         matched, in_map = match(state, event.select(seen)), in_map[seen]
@@ -600,6 +600,10 @@ class MapViews:
             turn = state.observer.reference_pose[: axes.point, : axes.point]
             of_map = self._covariances[in_map.argmax(axis=1), : axes.point, : axes.point]
             noise += turn.T @ of_map @ turn
+        if event.kinds is not None and residuals.D is not None:
+            # Ranges may be as much longer as is known of their scale.
+            D, p = residuals.D[:, : axes.point], axes.p
+            noise = noise + D @ state.known_errors.joint.of_robot[p:, p:] @ transpose(D)
         # About the robot, not the origin, which may be far off.
         place = state.observer.A[:3, 3].copy()
         C = axes.output_matrix(state.observer.points[residuals.rows] - place + 0.5 * residuals.r)

@@ -156,6 +156,23 @@ def test_a_start_known_to_metres_is_honest_although_half_points_are_not_linear(k
     assert 0.5 < np.mean(nees) < 2.0
 
 
+def test_wheels_that_spin_leave_the_pose_less_sure_by_bearings_alone():
+    nees = []
+    for seed in range(4):
+        world = World(SETTINGS, seed=seed)
+        world.drive(16.0, [BEARING], rows=(0, 1))
+        for step in range(20):
+            stands = world.A
+            world.drive(0.4, [BEARING], rows=(0, 1))
+            if step < 3:  # only the odometry goes on
+                world.A = stands
+            world.drive(0.1, [BEARING], rows=(0, 1))
+            off = (world.estimator.pose - world.A)[:2, 3]
+            P = world.estimator.pose_covariance[3:5, 3:5]
+            nees.append(off @ np.linalg.solve(P, off) / 2.0)
+    assert np.mean(nees) < 15.0
+
+
 def test_bearings_show_how_noisy_the_motion_is_as_points_do():
     stated = (0.0, 0.0, 0.005)
     settings = replace(SETTINGS, motion_noise_factor='auto', angular_velocity_noise=stated)
