@@ -287,20 +287,33 @@ def _curved(state: State, event: ObservationEvent, rows: IntArray) -> Observatio
 
 
 def _apart(state: State, rows: IntArray) -> FloatArray:
-    """Return how uncertain it is where landmarks ``rows`` are from the robot (m, 3, 3), body."""
+    """Return how uncertain it is where landmarks ``rows`` are from the robot (m, 3, 3), body.
+
+    Without the part α of it that turns with the robot's error of attitude θ, as where a whole map
+    is turned: α G θ with the least of E‖δ − α G θ‖². An arc about the robot has no second order.
+    """
     errors, (p, k) = state.known_errors, (state.axes.p, state.axes.point)
+    robot, turns = state.observer.A[None, :3, 3], slice(0, p - k)
     # However the robot is turned: about itself that moves nothing.
-    to_robot = state.axes.output_matrix(state.observer.A[None, :3, 3])[0]
+    to_robot = state.axes.output_matrix(robot)[0]
     joint, full = errors.joint_covariance(rows), np.zeros((len(rows), 3, 3))
     P = errors.joint.pose if joint is None else joint[:p, :p]
-    full[:, :k, :k] = to_robot @ P @ to_robot.T
+    apart = np.tile(to_robot @ P @ to_robot.T, (len(rows), 1, 1))
+    with_turn = np.tile(-to_robot @ P[:, turns], (len(rows), 1, 1))
     if joint is not None:
         with_robot = (to_robot @ joint[:p, p:]).reshape(k, -1, k).swapaxes(0, 1)
-        own = diagonal_blocks(joint[p:, p:], k)
-        full[:, :k, :k] += own - with_robot - transpose(with_robot)
+        apart += diagonal_blocks(joint[p:, p:], k) - with_robot - transpose(with_robot)
+        with_turn += joint[p:, turns].reshape(-1, k, p - k)
+    G = state.axes.output_matrix(state.observer.points[rows])[..., turns] - to_robot[:, turns]
+    by_turn = G @ P[turns, turns]
+    most = np.sum(by_turn * G, axis=(1, 2))
+    share = np.sum(with_turn * G, axis=(1, 2)) / np.maximum(most, np.finfo(float).tiny)
+    alpha = np.clip(share, 0.0, 1.0)[:, None, None]
+    both = alpha * (G @ transpose(with_turn))
+    full[:, :k, :k] = apart - both - transpose(both) + alpha**2 * (by_turn @ transpose(G))
     R = state.observer.A[:3, :3]
-    turned: FloatArray = R.T @ full @ R
-    return turned
+    seen: FloatArray = R.T @ full @ R
+    return seen
 
 
 def with_kinds(update: Update, event: ObservationEvent) -> Update:

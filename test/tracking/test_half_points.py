@@ -173,6 +173,26 @@ def test_wheels_that_spin_leave_the_pose_less_sure_by_bearings_alone():
     assert np.mean(nees) < 15.0
 
 
+@pytest.mark.parametrize('settings', [SETTINGS, SPATIAL])
+@pytest.mark.parametrize('kind', [RANGE, BEARING])
+def test_a_map_that_is_turned_as_a_whole_leaves_half_points_linear(settings, kind):
+    maps = []
+    for heading_rad in (1e-3, 0.3):  # of the robot, and with it of all that it maps
+        world = World(settings, known=False)
+        turned = np.diag([0.0, 0.0, heading_rad**2, 0.0, 0.0, 0.0])
+        world.estimator.set_pose(np.eye(4), turned)
+        lines = world.points / np.linalg.norm(world.points, axis=1, keepdims=True)
+        ranges = np.linalg.norm(world.points, axis=1, keepdims=True) * [1.0, 0.0, 0.0]
+        world.estimator.add(VelocityEvent(0, np.zeros(6)))
+        world.estimator.add(ObservationEvent(0, np.arange(N), world.points))
+        for step in range(1, 11):
+            shown, kinds = ranges if kind == RANGE else lines, np.full(N, kind)
+            world.estimator.add(VelocityEvent(step * STEP_NS, np.zeros(6)))
+            world.estimator.add(ObservationEvent(step * STEP_NS, np.arange(N), shown, kinds=kinds))
+        maps.append(world.estimator.world_points)
+    assert maps[1] == pytest.approx(maps[0], abs=0.01)
+
+
 def test_bearings_show_how_noisy_the_motion_is_as_points_do():
     stated = (0.0, 0.0, 0.005)
     settings = replace(SETTINGS, motion_noise_factor='auto', angular_velocity_noise=stated)
