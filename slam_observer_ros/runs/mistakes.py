@@ -278,7 +278,8 @@ What is right gains several as a rule, but sizes of tags, which wheels are to sh
 STRETCH_NS, THROUGHOUT = to_ns(5.0), 0.25
 """Stretches of a drive, and the share of them that is likelier at least if a mistake explains it.
 
-N gains that are equal, among others that are nothing, have a sum of √N times their norm.
+N gains that are equal, among others that are nothing, have a sum of √N times their norm. A
+stretch counts for SURE at most: where a filter is lost, a single one may be worth all others.
 """
 
 NOTABLE_TURN_RAD = 1.0
@@ -502,7 +503,7 @@ class _Score:
         ends_ns = [each.likelihood.stamps_ns[[0, -1]] for each in (self, other)]
         edges = np.arange(np.min(ends_ns), np.max(ends_ns) + STRETCH_NS + 1, STRETCH_NS)
         (one, counts), (another, other_counts) = (each._stretches(edges) for each in (self, other))
-        gains = np.minimum(counts, other_counts) * (one - another)
+        gains = np.clip(np.minimum(counts, other_counts) * (one - another), -SURE, SURE)
         least = THROUGHOUT * np.count_nonzero(gains) * np.square(gains).sum()
         return bool(gains.sum() > math.sqrt(least))
 
