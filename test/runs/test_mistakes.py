@@ -11,7 +11,8 @@ import pytest
 from slam_observer_ros.common.findings import explained, found
 from slam_observer_ros.events import ObservationEvent, RANGE, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.lie import so3
-from slam_observer_ros.runs.mistakes import first_drive, mistakes
+from slam_observer_ros.runs.mistakes import _Score, AS_IT_IS, first_drive, mistakes
+from slam_observer_ros.runs.recorders import Likelihood
 
 
 def named(events, settings=SETTINGS):
@@ -126,6 +127,19 @@ def test_somebody_who_carries_the_robot_makes_no_mistake_likelier():
     a_while = range(len(events) // 2, 6 * len(events) // 10)
     other_way = list(MADE['turning_negated'].apply(events))
     assert named([other_way[i] if i in a_while else e for i, e in enumerate(events)]) == []
+
+
+@pytest.mark.parametrize(('gain', 'most', 'is_clear'), [(5.0, 1e3, True), (0.0, 1e3, False)])
+def test_what_helps_throughout_is_clear_though_it_helps_once_far_more(gain, most, is_clear):
+    stamps_ns, ones = 5_000_000_000 * np.arange(20), np.ones(20)
+
+    def score(log_densities):
+        return _Score(
+            AS_IT_IS, Likelihood(stamps_ns, log_densities, ones), 0.0, 0.0, 1.0, 1.0, 1.0
+        )
+
+    gains = np.where(stamps_ns > 0, gain, most)
+    assert score(gains).is_clearly_better(score(0.0 * ones)) == is_clear
 
 
 def test_a_wrong_size_of_tags_is_named_and_its_factor_estimated():
