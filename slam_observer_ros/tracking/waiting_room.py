@@ -21,7 +21,7 @@ import numpy as np
 
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import ObservationEvent, RANGE
+from slam_observer_ros.events import AZIMUTH, AZIMUTH_RANGE, ObservationEvent, RANGE
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.sensor_mounting import directions_of, MEASURED, Sensed, UNMEASURED_M
 from slam_observer_ros.smoothing.history import Keyframe
@@ -223,6 +223,8 @@ class WaitingRoom:
         """
         self._way.go_on(state, event.stamp_ns)
         view = self._way.view(state, event, row, covariance, self._observations)
+        if state.axes.point == 3 and view.kind in (AZIMUTH, AZIMUTH_RANGE):
+            return None  # no height follows from it, or hardly
         landmark_id = view.landmark_id
         views = self._views.setdefault(landmark_id, deque(maxlen=MOST_VIEWS))
         of_sensor = view.kind, view.sensor_frame

@@ -244,6 +244,13 @@ def test_a_straight_way_leaves_open_on_which_side_an_anchor_is():
     assert world.estimator.counts['waiting_point'] == world.estimator.counts['observed_point']
 
 
+def test_an_azimuth_alone_places_no_new_landmark_in_space():
+    world = World(SPATIAL, known=False)
+    world.drive(20.0, [AZIMUTH], rows=range(N))
+    assert not len(world.estimator.landmark_ids)
+    assert world.errors[-1] < 2.0
+
+
 def test_half_points_without_ids_are_left_out_counted_and_named(caplog):
     world = World(SETTINGS)
     for event in world.seen(np.arange(4), [RANGE]):
