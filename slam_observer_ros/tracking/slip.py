@@ -634,8 +634,10 @@ class MapViews:
         self._m = share[:, 0] * (self._m @ there) + said[:, 0]
         self._M = share**2 * (there.T @ self._M @ there) + said[:, 1:]
         self._L = share * (there.T @ self._L @ there) + said[:, 1:]
-        self._W = share[0] * (there.T @ self._W @ there) + W
-        self._c = share[:, 0] * (self._c @ back.T) + P @ said[:, 0]
+        # Half points leave more open than a turn about a point.
+        whole = float(event.kinds is None)
+        self._W = share[0] * (there.T @ self._W @ there) + whole * W
+        self._c = share[:, 0] * (self._c @ back.T) + whole * (P @ said[:, 0])
 
     def _moved(self, shift: FloatArray) -> FloatArray:
         """Return which error (p, p) about a point is one about the point ``shift`` (3,) on."""
