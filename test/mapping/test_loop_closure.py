@@ -186,8 +186,8 @@ def test_that_a_loop_has_closed_is_logged(caplog):
     state, _ = after_a_loop(points_in_a_hall(0), np.arange(3, 10))
     estimator._hypotheses.reset(state)
     caplog.set_level('INFO', logger='slam_observer_ros')
-    estimator._find_doubled(LOOP_NS + 10**9)
+    estimator._judge_map(LOOP_NS + 10**9)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line == 'A loop has closed: 7 landmarks without ids were seen before.'
-    estimator._find_doubled(LOOP_NS + 2 * 10**9)
+    estimator._judge_map(LOOP_NS + 2 * 10**9)
     assert len(caplog.records) == 1
