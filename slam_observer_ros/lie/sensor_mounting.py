@@ -34,6 +34,9 @@ UNMEASURED_M = 1e3
 """Standard deviation of a completed point where nothing was measured: as large as a message may
 state one."""
 
+LEAST_M = 0.05
+"""Least distance of a landmark, metres: its sensor has an extent."""
+
 _TINY = np.finfo(np.float64).tiny
 
 

@@ -21,6 +21,7 @@ from slam_observer_ros.lie.matrices import transpose
 from slam_observer_ros.lie.sensor_mounting import (
     completed_lines,
     directions_of,
+    LEAST_M,
     MEASURED,
     measured_axes,
     Sensed,
@@ -34,9 +35,6 @@ from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 
 FlatSensed: TypeAlias = tuple[IntArray, FloatArray, FloatArray, FloatArray, IntArray]
 """What C reads of the sensors of M points, see :meth:`SensedPoints.flat`."""
-
-LEAST_M = 0.05
-"""Least distance of a landmark whose direction is measured: the sensor has an extent."""
 
 NO_SENSORS = None, None, None, np.empty((0, 7)), np.empty((0, 7), dtype=np.int64)
 """The same where none is calibrated."""

@@ -30,6 +30,7 @@ from slam_observer_ros.lie.matrices import diagonal_blocks, transpose
 from slam_observer_ros.lie.sensor_mounting import (
     completed_lines,
     directions_of,
+    LEAST_M,
     MEASURED,
     measured_axes,
     unmeasured_covariances,
@@ -45,9 +46,6 @@ from slam_observer_ros.tracking.waiting_room import (
     WaitingRoom,
     Window,
 )
-
-LEAST_M = 0.05
-"""Least distance of a landmark: its sensor has an extent."""
 
 KEPT, FEWEST = 200, 40
 """Differences of ranges that are kept, and that it takes to judge them."""

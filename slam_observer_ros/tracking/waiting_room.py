@@ -23,7 +23,13 @@ from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import AZIMUTH, AZIMUTH_RANGE, ObservationEvent, RANGE
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.lie.sensor_mounting import directions_of, MEASURED, Sensed, UNMEASURED_M
+from slam_observer_ros.lie.sensor_mounting import (
+    directions_of,
+    LEAST_M,
+    MEASURED,
+    Sensed,
+    UNMEASURED_M,
+)
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.smoothing.relinearisation import Placed
 
@@ -461,7 +467,7 @@ class _PlaceProblem:
         Of points p (b, 3).
         """
         d = p[:, None] - self._origins[self._at]
-        r = np.maximum(np.linalg.norm(d, axis=2), 0.05)
+        r = np.maximum(np.linalg.norm(d, axis=2), LEAST_M)
         directions = directions_of(d.reshape(-1, 3)).reshape(*d.shape, 3)
         u = directions[:, :, 0]
         b = np.take_along_axis(directions, self._axis[None, :, None, None], axis=2)[:, :, 0]

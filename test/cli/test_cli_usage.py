@@ -258,14 +258,8 @@ def test_what_is_not_needed_is_not_imported(arguments, unneeded):
         f'try:\n    main({arguments})\nexcept SystemExit:\n    pass\n'
         'print(*sys.modules, file=sys.stderr)'
     )
-    ended = subprocess.run(
-        [sys.executable, '-c', program],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
+    ended = run_program(program)
+    ended.check_returncode()
     assert ended.stdout
     assert not unneeded & set(ended.stderr.split())
 
