@@ -197,11 +197,10 @@ def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -
     return pose(R @ so3.exp(share * turn), start[..., :3, 3] + share * shift)
 
 
+# Singular values (m²) below this part of the largest carry no direction, only rounding.
 _RANK_TOLERANCE = 1e-12
-"""Singular values (m²) below this part of the largest carry no direction, only rounding."""
 
-_ROUNDING = 1e-14
-"""Offsets from the mean below this part of the largest coordinate are rounding."""
+_ROUNDING = 1e-14  # offsets from the mean below this part of the largest coordinate are rounding
 
 
 def rigid_alignment(

@@ -19,6 +19,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.lie import so3
 
+# Which of range, azimuth and elevation is measured, by kind of point.
 MEASURED = np.array(
     [
         [True, True, True],
@@ -28,14 +29,12 @@ MEASURED = np.array(
         [True, True, False],
     ]
 )
-"""Which of range, azimuth and elevation is measured, by kind of point."""
 
+# Standard deviation of a completed point where nothing was measured: as large as a message may
+# state one.
 UNMEASURED_M = 1e3
-"""Standard deviation of a completed point where nothing was measured: as large as a message may
-state one."""
 
-LEAST_M = 0.05
-"""Least distance of a landmark, metres: its sensor has an extent."""
+LEAST_M = 0.05  # least distance of a landmark, metres: its sensor has an extent
 
 _TINY = np.finfo(np.float64).tiny
 

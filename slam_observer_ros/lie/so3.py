@@ -30,11 +30,10 @@ _THREE = 3.0 * _IDENTITY
 # Added to θ²: 0/0 becomes 0 / 1e-300, and any angle above 1e-142 rad keeps all its bits.
 _ZERO_GUARD = 1e-300
 
-ROUNDING = 1e-12
-"""How far RᵀR may be from identity after many products."""
+ROUNDING = 1e-12  # how far RᵀR may be from identity after many products
 
+# How far the norm of a quaternion that is a rotation may be from 1.
 QUATERNION_NORM_TOLERANCE = 0.1
-"""How far the norm of a quaternion that is a rotation may be from 1."""
 
 
 def hat(phi: FloatArray) -> FloatArray:
@@ -49,8 +48,7 @@ def vee(K: FloatArray) -> FloatArray:
     return K[..., (2, 0, 1), (1, 2, 0)]
 
 
-Scale: TypeAlias = FloatArray | float
-"""What scales a stack of matrices, or one."""
+Scale: TypeAlias = FloatArray | float  # what scales a stack of matrices, or one
 
 
 def coefficients(phi: FloatArray) -> tuple[Scale, Scale, Scale]:

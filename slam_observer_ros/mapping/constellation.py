@@ -29,14 +29,11 @@ from slam_observer_ros.mapping.places import (
     Weighing,
 )
 
+# How often a point is looked for in the map, in all: that takes a second or less.
 MAX_LOOKS = 500_000
-"""How often a point is looked for in the map, in all: that takes a second or less."""
 
-MAX_PLACES = 400
-"""Places that are weighed, which takes a millisecond each."""
-
-AT_ONCE = 4096
-"""Sets of landmarks that are looked at together. After them the search may be over."""
+MAX_PLACES = 400  # places that are weighed, which takes a millisecond each
+AT_ONCE = 4096  # sets of landmarks that are looked at together. After them the search may be over
 
 
 def find_places(

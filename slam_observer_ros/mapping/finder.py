@@ -38,23 +38,14 @@ from slam_observer_ros.tracking.state import State
 
 logger = logging.getLogger(__name__)
 
-MIN_COUNT = 2
-"""How often a landmark must have been seen: most false points are seen once."""
+MIN_COUNT = 2  # how often a landmark must have been seen: most false points are seen once
+MAX_SOUGHT = 12  # landmarks by which places are searched for, those seen last
+MAX_WEIGHED = 60  # landmarks by which the places that were found are weighed
+MAX_FITTING = 50  # places that are weighed by all of these
+FEWEST_COMPARED = 2  # landmarks beyond those that fix a place by which ids and places are compared
 
-MAX_SOUGHT = 12
-"""Landmarks by which places are searched for, those seen last."""
-
-MAX_WEIGHED = 60
-"""Landmarks by which the places that were found are weighed."""
-
-MAX_FITTING = 50
-"""Places that are weighed by all of these."""
-
-FEWEST_COMPARED = 2
-"""Landmarks beyond those that fix a place by which ids and places are compared."""
-
+# How many times as often landmarks must have been seen before it is worth searching again.
 NEWS = 1.3
-"""How many times as often landmarks must have been seen before it is worth searching again."""
 
 
 def warn_of_symmetry(loaded: LandmarkMap, name: str) -> None:
@@ -259,8 +250,7 @@ def _largest_mass(places: Places) -> float:
     return places.all[0].log_mass if places.all else -math.inf
 
 
-MAX_PLACES, MAX_SEEN = 600, 12
-"""Places of a look around, and landmarks in view that it goes by."""
+MAX_PLACES, MAX_SEEN = 600, 12  # places of a look around, and landmarks in view that it goes by
 
 
 @dataclass(frozen=True, slots=True, eq=False)

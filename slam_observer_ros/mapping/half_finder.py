@@ -32,32 +32,28 @@ from slam_observer_ros.tracking.half_points import of_axes
 from slam_observer_ros.tracking.state import State
 from slam_observer_ros.tracking.waiting_room import FEWEST_VIEWS, Window
 
-HEADINGS = 24
-"""Turns from which a solution is sought in the plane; in space as many and more."""
+HEADINGS = 24  # turns from which a solution is sought in the plane; in space as many and more
 
+# Starts that are followed on after ``FIRST_STEPS``, and minima that are fitted with all noise.
 MOST_KEPT, MOST_FITTED = 32, 8
-"""Starts that are followed on after ``FIRST_STEPS``, and minima that are fitted with all noise."""
 
 FIRST_STEPS, STEPS, FITTING_STEPS = 5, 20, 10
 
-ONE = 0.03
-"""Rad, and share of the map, within which two descents have ended at one minimum."""
+ONE = 0.03  # rad, and share of the map, within which two descents have ended at one minimum
 
+# By how many times the views have grown when it is searched again, and after how many at most.
 TRY_AGAIN, MOST_BETWEEN = 1.2, 10
-"""By how many times the views have grown when it is searched again, and after how many at most."""
 
+# Share of the views that a pose explains, their χ² per view, and by how much more others have: the
+# odds are e^15 then.
 MOST, FITS, APART = 0.5, 2.5, 30.0
-"""Share of the views that a pose explains, their χ² per view, and by how much more others have:
-the odds are e^15 then."""
 
+# Standard deviations within which two minima are one, and a way on a line has no other side.
 SAME = 1.0
-"""Standard deviations within which two minima are one, and a way on a line has no other side."""
 
+# Largest standard deviations of the turn, rad, and of the place, as a share of the distances. With
+# three of them the error of the second order is a fiftieth, and the filter can start.
 SURE_RAD, SURE = 0.07, 0.02
-"""Largest standard deviations of the turn, rad, and of the place, as a share of the distances.
-
-With three of them the error of the second order is a fiftieth, and the filter can start.
-"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

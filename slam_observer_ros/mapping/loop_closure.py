@@ -24,35 +24,24 @@ from slam_observer_ros.tracking.state import State
 
 logger = logging.getLogger(__name__)
 
-PERIOD_NS = 5_000_000_000
-"""Time between two searches, nanoseconds."""
+PERIOD_NS = 5_000_000_000  # time between two searches, nanoseconds
+MAX_SOUGHT = 12  # new landmarks that are looked for among old ones, those seen last
+MAX_OLD = 400  # old landmarks among which they are looked for: the nearest ones
+REACH = 4.0  # standard deviations of the pose within which a loop may close
+MOST = 4.0  # normalised square, per axis, of how far landmarks may be apart that are one
 
-MAX_SOUGHT = 12
-"""New landmarks that are looked for among old ones, those seen last."""
-
-MAX_OLD = 400
-"""Old landmarks among which they are looked for: the nearest ones."""
-
-REACH = 4.0
-"""Standard deviations of the pose within which a loop may close."""
-
-MOST = 4.0
-"""Normalised square, per axis, of how far landmarks may be apart that are one."""
-
+# Standard deviation of how far apart they may be though exactly known, metres: no two views of a
+# thing have quite the same centre.
 LEAST_M = 0.01
-"""Standard deviation of how far apart they may be though exactly known, metres: no two views of a
-thing have quite the same centre.
-"""
 
+# Landmarks next to one to which distances say how well it is known where it lies there.
 NEIGHBOURS = 3
-"""Landmarks next to one to which distances say how well it is known where it lies there."""
 
 
-HALF = 0.5
-"""Share of how often two would be seen side by side from which on they are two."""
+HALF = 0.5  # share of how often two would be seen side by side from which on they are two
 
+# −ln of the probability below which it is no chance that a landmark in view is not seen.
 SHOULD_BE_SEEN = 3.0
-"""−ln of the probability below which it is no chance that a landmark in view is not seen."""
 
 
 class LoopClosure:

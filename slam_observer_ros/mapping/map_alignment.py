@@ -26,14 +26,11 @@ from slam_observer_ros.tracking.state import State
 
 logger = logging.getLogger(__name__)
 
+# Standard deviation about any axis beyond which landmarks don't determine the attitude. Three of
+# them in a line leave the roll about it open; two that are close together, the heading.
 MAX_TURN_STD_RAD = 0.2
-"""Standard deviation about any axis beyond which landmarks don't determine the attitude.
 
-Three of them in a line leave the roll about it open; two that are close together, the heading.
-"""
-
-CONTRADICTION_SIGMAS = 4.0
-"""Landmarks whose misfit is as improbable as this contradict each other."""
+CONTRADICTION_SIGMAS = 4.0  # landmarks whose misfit is as improbable as this contradict each other
 
 
 def find_transform(
@@ -156,8 +153,7 @@ class Likeness:
         return turned + (f'{joint} shifted by ({x:.1f}, {y:.1f}, {z:.1f}) m' if is_shifted else '')
 
 
-LEAST_TURN_DEG = 6.0
-"""Least turn about the vertical that makes another place."""
+LEAST_TURN_DEG = 6.0  # least turn about the vertical that makes another place
 
 
 def likeness_by_ids(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
@@ -180,8 +176,8 @@ def likeness_by_ids(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
     return None
 
 
+# Landmarks that show that two maps are one place: of two alone only the distance has to fit.
 LEAST_SAME = 3
-"""Landmarks that show that two maps are one place: of two alone only the distance has to fit."""
 
 
 class AlikeMaps:
@@ -248,12 +244,8 @@ class Differences:
         return ''
 
 
-NEAR = 3.0
-"""Standard deviations of a point within which it is where a landmark is."""
-
-
-SIGHTINGS = 2
-"""Sightings of a tag that must agree: a single one may be flipped."""
+NEAR = 3.0  # standard deviations of a point within which it is where a landmark is
+SIGHTINGS = 2  # sightings of a tag that must agree: a single one may be flipped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -302,11 +294,8 @@ def pose_by_tag(state: State, known: LandmarkMap, refused: AbstractSet[int]) -> 
     return TagPose(int(known.ids[at]), pose, covariance, known)
 
 
-MAX_ALIKE = 64
-"""Landmarks that the outermost one of a map is taken to be, at most."""
-
-CELLS = 40
-"""Along the longer side of a map, free places for one more landmark."""
+MAX_ALIKE = 64  # landmarks that the outermost one of a map is taken to be, at most
+CELLS = 40  # along the longer side of a map, free places for one more landmark
 
 
 def symmetries(known: LandmarkMap) -> list[Likeness]:

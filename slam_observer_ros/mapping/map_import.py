@@ -88,23 +88,21 @@ MAX_BYTES = 20_000_000
 
 LAYOUTS = "TagSLAM's files, with 'bodies', or apriltag_ros's, with 'tag_bundles'"
 
+# The axes x, y, z that detectors give a tag, along those in the files; ``none`` for points.
 TAG_AXES: Mapping[str, Sequence[float]] = {
     'right-up-out': (1.0, 1.0, 1.0),
     'right-down-in': (1.0, -1.0, -1.0),
     'left-down-out': (-1.0, -1.0, 1.0),
     'none': (0.0, 0.0, 0.0),
 }
-"""The axes x, y, z that detectors give a tag, along those in the files; ``none`` for points."""
 
-LENGTHS = ('m', 'cm', 'mm')
-"""Units of coordinates."""
+LENGTHS = ('m', 'cm', 'mm')  # units of coordinates
 
+# Extent of a map, and distance of half of its landmarks to the nearest other, from which on both
+# its coordinates are hardly in metres: no sensor sees two of them at once.
 WIDE_M, SPARSE_M = 1000.0, 100.0
-"""Extent of a map, and distance of half of its landmarks to the nearest other, from which on both
-its coordinates are hardly in metres: no sensor sees two of them at once."""
 
-MAX_NAMED = 12
-"""Of what is left out, as many are named in one line."""
+MAX_NAMED = 12  # of what is left out, as many are named in one line
 
 
 def import_map(
@@ -357,8 +355,8 @@ def _field_rows(content: Any) -> list[Row]:
     return rows
 
 
+# Of a table without a header, in this order; z and sigma may be left out.
 COLUMNS = ('id', 'x', 'y', 'z', 'sigma')
-"""Of a table without a header, in this order; z and sigma may be left out."""
 
 QUATERNION = ('qx', 'qy', 'qz', 'qw')
 
@@ -373,22 +371,19 @@ OTHER_NAMES = {
     **{f'{before}{axis}': axis for before in ('t', 'pos_', 'position_') for axis in 'xyz'},
 }
 
+# Columns of numbers that a map does without; others may be of a kind that changes it.
 IGNORED = ('size', 'tag_size', 'observations')
-"""Columns of numbers that a map does without; others may be of a kind that changes it."""
 
 UNITS = {'': 1.0, 'm': 1.0, 'rad': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'deg': np.pi / 180.0}
 UNITS['°'] = UNITS['deg']
 
-UNKNOWN_M = 10.0
-"""Standard deviation of a height that a table does not have."""
-
-MAX_YAW_RAD = 6.3
-"""A larger one is taken to be in degrees."""
+UNKNOWN_M = 10.0  # standard deviation of a height that a table does not have
+MAX_YAW_RAD = 6.3  # a larger one is taken to be in degrees
 
 _UNIT = re.compile(r'(.*?)\s*[\[(](.*)[\])]|(.+)_(m|mm|cm|rad|deg)')
 _COMMA_OF_DECIMALS = re.compile(r'[-+]?\d*,\d+(?:[eE][-+]?\d+)?')
+# What spaces separate; a comma inside is one of decimals.
 _WORDS = re.compile(r'(?:[^\s,]+|[-+]?\d*,\d+)(?:\s+(?:[^\s,]+|[-+]?\d*,\d+))+')
-"""What spaces separate; a comma inside is one of decimals."""
 
 _FIDUCIAL_SLAM = ('id', 'x', 'y', 'z', 'roll', 'pitch', 'yaw', 'variance', 'observations')
 

@@ -31,38 +31,22 @@ from slam_observer_ros.lie.matrices import (
 )
 from slam_observer_ros.mapping.landmark_map import MappedLandmarks
 
-GATE = 3.7
-"""Standard deviations that a point may be off."""
+GATE = 3.7  # standard deviations that a point may be off
+MAX_ROUNDS = 4  # how often a place is fitted to its matches, and matched again
+RIVALS = 4  # landmarks near a point among which the most likely one is taken
 
-MAX_ROUNDS = 4
-"""How often a place is fitted to its matches, and matched again."""
-
-RIVALS = 4
-"""Landmarks near a point among which the most likely one is taken."""
-
+# By how much variances may turn out larger than stated: real noise is not white.
 MAX_VARIANCE_FACTOR = 4.0
-"""By how much variances may turn out larger than stated: real noise is not white."""
 
+# Parameters of the beta distribution of f: one point in five is of no landmark, or none, or most
+# of them.
 FALSE, TRUE = 1.0, 4.0
-"""Parameters of the beta distribution of f: one point in five is of no landmark, or none, or most
-of them.
-"""
 
-NOWHERE = 0.1
-"""Probability beforehand that the robot is not in the map."""
-
-LEAST_VIEW_M = 1.0
-"""Radius of what is in view at least, metres."""
-
-LEAST_STD = 1e-3
-"""Standard deviation of a given pose at least, rad and m."""
-
-SAMPLED = 64
-"""Landmarks around which others are counted, to know how many are in view anywhere."""
-
-
-LEAST_SHARE = 0.01
-"""Probability from which a place is named to a person."""
+NOWHERE = 0.1  # probability beforehand that the robot is not in the map
+LEAST_VIEW_M = 1.0  # radius of what is in view at least, metres
+LEAST_STD = 1e-3  # standard deviation of a given pose at least, rad and m
+SAMPLED = 64  # landmarks around which others are counted, to know how many are in view anywhere
+LEAST_SHARE = 0.01  # probability from which a place is named to a person
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,8 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 
+# One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it.
 Buffer: TypeAlias = bytes | bytearray | memoryview
-"""One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""
 
 ENCAPSULATION_BYTES = 4
 MAX_PADDING_BYTES = 3

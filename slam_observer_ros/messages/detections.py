@@ -27,8 +27,8 @@ POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 DETECTIONS = 'vision_msgs/msg/Detection3DArray'
 BOXES = 'vision_msgs/msg/Detection2DArray'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+# Types that have pixels, which are directions where the camera's CameraInfo is known.
 IN_IMAGES = (APRILTAGS, BOXES)
-"""Types that have pixels, which are directions where the camera's CameraInfo is known."""
 
 _POSE = 7
 _COVARIANCE = 36
@@ -39,8 +39,8 @@ _BOX = 5  # centre, rotation and size
 MAX_NAMES = 12  # names of frames that a log line lists
 
 _TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
+# A UUID, too. Names with a number, as ``facade12`` or ``b-000123``, have no letter after it.
 _HASH = re.compile(r'(?<![^\W_])(?=.*\d[a-f])[\da-f-]{8,}\Z', re.IGNORECASE)
-"""A UUID, too. Names with a number, as ``facade12`` or ``b-000123``, have no letter after it."""
 _HASH_LENGTH = 64  # no more of a name is searched: that takes the square of the length
 
 
@@ -116,6 +116,7 @@ def _read_detections(
     return observed_poses(frame_id, stamp_ns, ids, poses, covariances)
 
 
+# Releases of vision_msgs until ROS 2 Foxy, by what is behind the box of a detection.
 OTHER_DETECTIONS: dict[tuple[str, ...], tuple[str, Decoder[ObservationEvent]]] = {
     fields: (release, Decoder(partial(_read_detections, rest=fields, has_numbers=has_numbers)))
     for release, fields, has_numbers in (
@@ -123,7 +124,6 @@ OTHER_DETECTIONS: dict[tuple[str, ...], tuple[str, Decoder[ObservationEvent]]] =
         ('ROS 1', ('source_cloud',), True),  # whose classes are numbers
     )
 }
-"""Releases of vision_msgs until ROS 2 Foxy, by what is behind the box of a detection."""
 
 
 def observed_tags(

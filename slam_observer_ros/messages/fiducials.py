@@ -22,8 +22,7 @@ from slam_observer_ros.messages.registry import reads
 _POSE = 7
 _COVARIANCE = 36
 _CENTRE_AND_CORNERS = 15
-NESTED = f'{"=" * 80}\nMSG: '
-"""What comes before the name of a nested type in a definition."""
+NESTED = f'{"=" * 80}\nMSG: '  # what comes before the name of a nested type in a definition
 
 
 @reads(
@@ -143,11 +142,11 @@ def _usable(ids: IntArray) -> IntArray:
     return np.where((ids >= 0) & (ids <= MAX_ID), ids, UNKNOWN_ID)
 
 
+# Names have the ids from here on, so that none is a number that people give landmarks.
 FIRST_NAMED_ID = 2**31
-"""Names have the ids from here on, so that none is a number that people give landmarks."""
 
+# Most names in a run: more are ids that change from message to message, as of a tracker.
 MAX_NAMES = 10_000
-"""Most names in a run: more are ids that change from message to message, as of a tracker."""
 
 
 class LandmarkNames:
@@ -186,8 +185,7 @@ class LandmarkNames:
         return number
 
 
-NAMES = LandmarkNames()
-"""The names of all landmarks that have been read in this process."""
+NAMES = LandmarkNames()  # the names of all landmarks that have been read in this process
 
 
 @reads(
@@ -400,6 +398,7 @@ _GTEC_RADIO = (
     'int32 first_path_amp3\nint32 max_growth_cir\nint32 rx_pream_count\nint32 first_path\n'
     'float64 channel\nint32 prf\nfloat64 datarate\nint32 preamble_length\nint32 pac_size\n'
 )
+# Fields behind the range, by type.
 _GTEC = {
     'Ranging': 'int32 seq\nfloat64 rss\nfloat64 error_estimation\n',
     'GenericRanging': 'int32 seq\nfloat64 rx_power\n',
@@ -409,7 +408,6 @@ _GTEC = {
         'float64 error_estimation\n'
     ),
 }
-"""Fields behind the range, by type."""
 
 
 def _register_gtec(name: str, rest: str) -> None:

@@ -195,8 +195,7 @@ def encode_point_cloud(stamp_ns: int, frame_id: str, ids: IntArray, points: Floa
     )
 
 
-_INTEGERS = (ID_NAME, NO_RANGE_NAME)
-"""Fields that are uint32; the others are float32."""
+_INTEGERS = (ID_NAME, NO_RANGE_NAME)  # fields that are uint32; the others are float32
 
 _Columns: TypeAlias = dict[str, FloatArray | IntArray]
 
@@ -248,8 +247,7 @@ def _cloud_records(columns: _Columns) -> NDArray[np.void]:
     return records
 
 
-PATH_SPACING_NS = 100_000_000
-"""Least time between two poses of the path, nanoseconds."""
+PATH_SPACING_NS = 100_000_000  # least time between two poses of the path, nanoseconds
 
 POINT_SIZE_M = 0.2
 TEXT_HEIGHT_M = 0.3

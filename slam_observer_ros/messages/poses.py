@@ -25,8 +25,7 @@ TRANSFORMS = 'tf2_msgs/msg/TFMessage'  # poses of sensors, and landmarks if they
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
-_NEARLY = 1.0 - 1e-9
-"""Of a limit: what is below that is below the limit, however it is rounded."""
+_NEARLY = 1.0 - 1e-9  # of a limit: what is below that is below the limit, however it is rounded
 
 
 @dataclass(frozen=True, slots=True)

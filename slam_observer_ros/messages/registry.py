@@ -24,11 +24,10 @@ from slam_observer_ros.settings.node_settings import message_types, MessageType,
 MessageT = TypeVar('MessageT')
 MessageT_co = TypeVar('MessageT_co', covariant=True)
 
+# From a serialised message and its receive time, which only unstamped messages use.
 Decode: TypeAlias = Callable[[Buffer, int], MessageT]
-"""From a serialised message and its receive time, which only unstamped messages use."""
 
-_COMPARED = 4
-"""Messages of the first block that are read one by one as well."""
+_COMPARED = 4  # messages of the first block that are read one by one as well
 
 
 class Decoder(Generic[MessageT_co]):

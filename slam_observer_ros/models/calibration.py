@@ -26,17 +26,15 @@ from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-MOVES = 6
-"""Column of b in [M b] (6, 7), which is multiplied by 1 where a velocity is not zero."""
+MOVES = 6  # column of b in [M b] (6, 7), which is multiplied by 1 where a velocity is not zero
 
+# Where τ is behind [M b], row by row, and behind it ``EACH`` values of each sensor.
 DELAY, SENSORS, EACH = 42, 43, 7
-"""Where τ is behind [M b], row by row, and behind it ``EACH`` values of each sensor."""
 
+# Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier. How
+# the robot moves so much later is not known yet when it is needed: without a limit the estimate,
+# which can't make up for it, would stray ever further.
 MIN_DELAY_S = -0.2
-"""Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier.
-How the robot moves so much later is not known yet when it is needed: without a limit the
-estimate, which can't make up for it, would stray ever further.
-"""
 
 
 class Entry(NamedTuple):
@@ -61,6 +59,7 @@ def _entries(parameter: str, places: Iterable[int]) -> list[Entry]:
 
 _PLACES = np.arange(DELAY).reshape(6, 7)  # of [M b]
 _SCALES, _BIASES = np.diagonal(_PLACES).tolist(), _PLACES[:, MOVES].tolist()
+# All that may be calibrated of velocities, the delay last: one more entry of M is a row more.
 OF_VELOCITY = (
     *_entries('angular_scale', _SCALES[:3]),
     *_entries('linear_scale', _SCALES[3:]),
@@ -68,20 +67,19 @@ OF_VELOCITY = (
     *_entries('linear_bias', _BIASES[3:]),
     *_entries(DELAY_NAME, [DELAY]),
 )
-"""All that may be calibrated of velocities, the delay last: one more entry of M is a row more."""
 
+# All that may be calibrated of a sensor: ψ, d and e^s.
 OF_SENSOR = (
     *_entries('sensor_rotation', range(3)),
     *_entries('sensor_translation', range(3, 6)),
     *_entries('range_scale', [SCALE := 6]),
 )
-"""All that may be calibrated of a sensor: ψ, d and e^s."""
 
+# Parameters that say how far these may be off, 0 for not at all.
 VELOCITY_STDDEVS, SENSOR_STDDEVS = (
     tuple(dict.fromkeys(f'{entry.parameter}_stddev' for entry in entries))
     for entries in (OF_VELOCITY, OF_SENSOR)
 )
-"""Parameters that say how far these may be off, 0 for not at all."""
 
 
 class CalibrationOwner(Protocol):

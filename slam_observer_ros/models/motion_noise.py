@@ -39,43 +39,35 @@ from slam_observer_ros.lie.matrices import (
 from slam_observer_ros.models.held_velocities import averaged, HeldVelocities
 from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
+# Standard deviations of a velocity beyond which a message only says 'unknown'. No robot turns or
+# moves as fast.
 MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
-"""Standard deviations of a velocity beyond which a message only says 'unknown'.
 
-No robot turns or moves as fast.
-"""
-
+# Standard deviations of a motion in one gap, rad and m: it is as unknown as it can be. More would
+# only drown all else that is known in rounding.
 MAX_GAP_ERRORS = np.repeat([np.pi, 1000.0], 3)
-"""Standard deviations of a motion in one gap, rad and m: it is as unknown as it can be.
 
-More would only drown all else that is known in rounding.
-"""
-
+# Time over which a velocity is averaged, as its error may be in proportion to it.
 SPEED_WINDOW_S = 1.0
-"""Time over which a velocity is averaged, as its error may be in proportion to it."""
 
-MEMORY = 300
-"""Observations over which the factors are found: they follow a change of the ground."""
+MEMORY = 300  # observations over which the factors are found: they follow a change of the ground
+MAX_STEP = 0.5  # change of ln ρ by one observation, at most
 
-MAX_STEP = 0.5
-"""Change of ln ρ by one observation, at most."""
-
+# Of ρ: a tenth to thirty times the standard deviation that is stated.
 LEAST_LOGARITHM, LARGEST_LOGARITHM = math.log(1e-2), math.log(1e3)
-"""Of ρ: a tenth to thirty times the standard deviation that is stated."""
 
-RARE = 2.33
-"""Standard deviations beyond which one in a hundred is."""
+RARE = 2.33  # standard deviations beyond which one in a hundred is
 
+# Least ln ρ that is applied, by ``motion_noise_factor``; 'stated' applies none.
 LEAST = {'stated': math.inf, 'at_least_stated': 0.0, 'auto': -math.inf}
-"""Least ln ρ that is applied, by ``motion_noise_factor``; 'stated' applies none."""
 
+# The motions that have a factor, and how the names of their noise begin.
 KINDS = {'turning': 'angular', 'driving': 'linear'}
-"""The motions that have a factor, and how the names of their noise begin."""
 
 _IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
 
+# Of the logarithm of a factor of the standard deviation at the start: half as for θ.
 PRIOR_DEVIATION = 0.5
-"""Of the logarithm of a factor of the standard deviation at the start: half as for θ."""
 
 
 class MotionFigures(NamedTuple):

@@ -23,11 +23,10 @@ from slam_observer_ros.models.point_noise import (
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 
-RESOLUTION_RAD = 1e-4
-"""Least standard deviation of an orientation about each axis."""
+RESOLUTION_RAD = 1e-4  # least standard deviation of an orientation about each axis
 
+# For which share of the time that a robot has stood its sensor's error is taken to last.
 LASTING = 0.1
-"""For which share of the time that a robot has stood its sensor's error is taken to last."""
 
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
@@ -119,14 +118,12 @@ class ObservationNoise:
 
 
 _CORNERS = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-LEAST_RANGE = 1.0
-"""Range, in edges of the tag, nearer than which no camera has all of it in view."""
+LEAST_RANGE = 1.0  # range, in edges of the tag, nearer than which no camera has all of it in view
 
+# Range, in edges of the tag, beyond which its corners are one point but for rounding.
 LARGEST_RANGE = 1e6
-"""Range, in edges of the tag, beyond which its corners are one point but for rounding."""
 
-LEAST_NOISE = 1e-6
-"""Noise of corners, in focal lengths, beside which less is lost in rounding."""
+LEAST_NOISE = 1e-6  # noise of corners, in focal lengths, beside which less is lost in rounding
 
 
 def orientation_covariances(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatArray:

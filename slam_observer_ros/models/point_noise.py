@@ -9,26 +9,22 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.lie.matrices import limited
 
+# Standard deviation that each coordinate of an observed point has at least. A smaller one is lost
+# in rounding beside a pose that may be off by a kilometre.
 RESOLUTION_M = 1e-4
-"""Standard deviation that each coordinate of an observed point has at least.
 
-A smaller one is lost in rounding beside a pose that may be off by a kilometre.
-"""
-
+# The same as a share of the distance, for points in single precision or better.
 RELATIVE_RESOLUTION = 1e-6
-"""The same as a share of the distance, for points in single precision or better."""
 
+# Standard deviation of an observed point beyond which a message only says 'unknown'.
 MAX_ERROR_M = 1e3
-"""Standard deviation of an observed point beyond which a message only says 'unknown'."""
 
+# Least variance of an observed point in any direction, as a share of its total variance. But no
+# more than (1 mm)², as of a bearing whose depth may be anywhere within a kilometre.
 MIN_SHARE, MOST_SHARE_M2 = 1e-6, 1e-6
-"""Least variance of an observed point in any direction, as a share of its total variance.
 
-But no more than (1 mm)², as of a bearing whose depth may be anywhere within a kilometre.
-"""
-
+# Observations that are less apart count as so far apart: two cameras may see at once.
 MIN_INTERVAL_S = 1e-3
-"""Observations that are less apart count as so far apart: two cameras may see at once."""
 
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)

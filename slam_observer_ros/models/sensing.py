@@ -22,8 +22,7 @@ from slam_observer_ros.lie.sensor_mounting import Sensed, sensitivity, turning
 from slam_observer_ros.models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
 
-LEAST_COSINE = 0.2
-"""Cosine of the angle off its axis, 78°, beyond which no sensor sees depth."""
+LEAST_COSINE = 0.2  # cosine of the angle off its axis, 78°, beyond which no sensor sees depth
 
 _ALONG_X = np.array([1.0, 0.0, 0.0])
 _TINY = np.finfo(np.float64).tiny
@@ -111,26 +110,18 @@ def cosines(arms: FloatArray, axis: FloatArray | None) -> FloatArray:
     return np.asarray(np.maximum(along / np.maximum(lengths, _TINY), LEAST_COSINE))
 
 
-MAX_WAITING = 100
-"""Observations that are remembered until they are used."""
+MAX_WAITING = 100  # observations that are remembered until they are used
+MAX_OBSERVATIONS = 20_000  # observations that are looked at, from the start of the run
+MOST_UNCOMPARED = 64  # observations whose ranges are compared at once
 
-MAX_OBSERVATIONS = 20_000
-"""Observations that are looked at, from the start of the run."""
-
-MOST_UNCOMPARED = 64
-"""Observations whose ranges are compared at once."""
-
+# Least number of points that says something, and the parts of them that scatter.
 MIN_POINTS, PARTS = 200, 20
-"""Least number of points that says something, and the parts of them that scatter."""
 
+# Standard deviation of ln cos b from which it does: half a field of view of some 25°.
 MIN_SPREAD = 0.02
-"""Standard deviation of ln cos b from which it does: half a field of view of some 25°."""
 
-MAX_BEHIND = 0.1
-"""Share of the points beside or behind the sensor beyond which it sees all around."""
-
-MAX_ERROR = 1.0
-"""Error of ln range beyond which a point is no measurement of its landmark."""
+MAX_BEHIND = 0.1  # share of the points beside or behind the sensor beyond which it sees all around
+MAX_ERROR = 1.0  # error of ln range beyond which a point is no measurement of its landmark
 
 
 class RangeErrors:

@@ -27,12 +27,11 @@ from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.models.calibration import Calibration
 from slam_observer_ros.models.velocity_history import VelocityHistory
 
+# Standard deviation over the median of the absolute value, of normal distributions.
 _PER_MEDIAN = 1.4826
-"""Standard deviation over the median of the absolute value, of normal distributions."""
 
 
-SAMPLED = 3
-"""One of so many motions is looked at: only ratios of sums count, and time."""
+SAMPLED = 3  # one of so many motions is looked at: only ratios of sums count, and time
 
 
 class DelayEvidence:

@@ -21,45 +21,34 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.models.held_velocities import held, HeldVelocities, Velocities
 
+# Stamp of a velocity that timed out before time began, nanoseconds.
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
-"""Stamp of a velocity that timed out before time began, nanoseconds."""
 
+# The last 16 times 64 periods show how long messages of a sensor are in force as a rule. So many
+# that they have pauses in them where these are usual, as of commands.
 BLOCK, BLOCKS = 64, 16
-"""The last 16 times 64 periods show how long messages of a sensor are in force as a rule.
 
-So many that they have pauses in them where these are usual, as of commands.
-"""
-
+# Periods that show how often messages come: a pause or two among them change nothing.
 FEWEST_PERIODS = 5
-"""Periods that show how often messages come: a pause or two among them change nothing."""
 
+# How long a velocity must have been exactly zero before the robot stands, nanoseconds. Commands
+# are ahead of the robot by their delay, and it coasts; both take less than that.
 STANDS_NS = NANOSECONDS_PER_SECOND
-"""How long a velocity must have been exactly zero before the robot stands, nanoseconds.
 
-Commands are ahead of the robot by their delay, and it coasts; both take less than that.
-"""
-
+# Angular velocity, less the bias at rest, beyond which the robot turns, rad/s. No bias is larger;
+# the noise of a MEMS gyroscope's reading is a third as large.
 TURNS = 0.03
-"""Angular velocity, less the bias at rest, beyond which the robot turns, rad/s.
 
-No bias is larger; the noise of a MEMS gyroscope's reading is a third as large.
-"""
-
+# Standard deviation of a gyroscope's bias that no average makes less, rad/s: 20° an hour. The
+# instability of a MEMS gyroscope, by data sheets; a robot that stands turns by less, too.
 INSTABILITY = 1e-4
-"""Standard deviation of a gyroscope's bias that no average makes less, rad/s: 20° an hour.
 
-The instability of a MEMS gyroscope, by data sheets; a robot that stands turns by less, too.
-"""
-
+# (6, 6) covariance of the velocity of a robot that stands, rad²/s² and m²/s²: next to none. In
+# eight hours, with twenty messages a second, it drifts by 4 mm. With much less, what links two
+# observations would weigh so much that smoothing had no digits left for what is seen.
 STANDING = 1e-4**2 * np.eye(6)
-"""(6, 6) covariance of the velocity of a robot that stands, rad²/s² and m²/s²: next to none.
 
-In eight hours, with twenty messages a second, it drifts by 4 mm. With much less, what links two
-observations would weigh so much that smoothing had no digits left for what is seen.
-"""
-
-FIRST_CAPACITY = 64
-"""Velocities that there is room for at first."""
+FIRST_CAPACITY = 64  # velocities that there is room for at first
 
 
 class VelocityHistory:

@@ -44,8 +44,7 @@ from slam_observer_ros.settings.node_settings import (
     Role,
 )
 
-QUEUE_DEPTH = 100
-"""Messages of an input that are kept while the node is busy."""
+QUEUE_DEPTH = 100  # messages of an input that are kept while the node is busy
 
 
 def open_inputs(

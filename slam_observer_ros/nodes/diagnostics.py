@@ -103,20 +103,17 @@ class LocalisationStatus:
         )
 
 
-WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000
-"""Time, and events, of late that are looked at."""
+WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000  # time, and events, of late that are looked at
 
+# Driving that says something; the most that a search may then take is left of a minute.
 LEAST_DRIVEN_S = 20.0
-"""Driving that says something; the most that a search may then take is left of a minute."""
 
+# How often a search goes on, and for how long, so that no message waits for it.
 PERIOD_S, SLICE_S = 0.03, 0.01
-"""How often a search goes on, and for how long, so that no message waits for it."""
 
+# Time between the starts of two searches, at most: before, most of the events are the same. Where
+# less was driven than in that time, new events are as many as old ones sooner.
 PAUSE_S = 60.0
-"""Time between the starts of two searches, at most: before, most of the events are the same.
-
-Where less was driven than in that time, new events are as many as old ones sooner.
-"""
 
 
 class MistakeWatch:

@@ -37,12 +37,11 @@ from slam_observer_ros.recordings.frames import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.runs.health import of_publishers
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
-PATH_LENGTH = 2000
-"""Most poses kept in the path, 0.1 s apart or more; the oldest go first."""
+PATH_LENGTH = 2000  # most poses kept in the path, 0.1 s apart or more; the oldest go first
 
+# Part of the period by which a state of the input that sets the pace may come early, as inputs
+# jitter, and by which other inputs wait for it.
 SLACK = 0.5
-"""Part of the period by which a state of the input that sets the pace may come early, as inputs
-jitter, and by which other inputs wait for it."""
 
 
 class Pace:
@@ -71,6 +70,7 @@ class Pace:
         self._due_s = max(self._due_s + self._period_s, earliest_s)
 
 
+# Topics of the estimate, before remapping.
 TOPICS = (
     '~/odometry',
     'pose',
@@ -80,11 +80,10 @@ TOPICS = (
     'landmark_map',
     'markers',
 )
-"""Topics of the estimate, before remapping."""
 
 
+# Odometry on /tf may be post-dated a little, so that it holds until the next one.
 MAX_AHEAD_S = 0.25
-"""Odometry on /tf may be post-dated a little, so that it holds until the next one."""
 
 
 class EstimatePublisher:

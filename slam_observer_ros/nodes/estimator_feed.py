@@ -33,32 +33,23 @@ from slam_observer_ros.recordings.frames import BaseFrame
 from slam_observer_ros.runs.health import ClockOffset
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, ON_TF
 
+# Inputs by the events that come of them; each has stamps of a clock of its own.
 SOURCES: dict[type[Event], str] = {
     VelocityEvent: 'twist',
     AngularVelocityEvent: 'imu',
     ObservationEvent: 'landmarks',
 }
-"""Inputs by the events that come of them; each has stamps of a clock of its own."""
 
 
-MAX_SENSORS = 100
-"""Frames whose clocks are looked at: somebody may publish under ever new names."""
+MAX_SENSORS = 100  # frames whose clocks are looked at: somebody may publish under ever new names
+Use: TypeAlias = Callable[[], None]  # uses a message that was held
+AROUND_S = 0.5  # how much later than /clock messages of the run before may come, by a steady clock
 
-
-Use: TypeAlias = Callable[[], None]
-"""Uses a message that was held."""
-
-AROUND_S = 0.5
-"""How much later than /clock messages of the run before may come, by a steady clock."""
-
+# How often a node looks whether /clock has jumped, every 20 ms, before it uses what it holds. Not
+# a time: a node that was held up itself has not seen yet what has come meanwhile.
 MAX_LOOKS = 25
-"""How often a node looks whether /clock has jumped, every 20 ms, before it uses what it holds.
 
-Not a time: a node that was held up itself has not seen yet what has come meanwhile.
-"""
-
-MAX_HELD = 10_000
-"""Messages that may wait for /clock to jump."""
+MAX_HELD = 10_000  # messages that may wait for /clock to jump
 
 
 class ClockChange:

@@ -157,11 +157,10 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
     return limited(given, MAX_POSE_ERRORS) + np.diag(assumed)
 
 
+# Speed beyond which a robot indoors does not drive: its odometry then is another.
 FAST_M_PER_S = 3.0
-"""Speed beyond which a robot indoors does not drive: its odometry then is another."""
 
-AT_START_M, AT_START_RAD = 0.1, 0.1
-"""How far from its origin an odometry is that has just begun."""
+AT_START_M, AT_START_RAD = 0.1, 0.1  # how far from its origin an odometry is that has just begun
 
 
 class KeptPose:

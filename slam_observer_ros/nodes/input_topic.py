@@ -29,27 +29,23 @@ from slam_observer_ros.nodes.ros_node import (
 )
 from slam_observer_ros.runs.health import Backlog, of_publishers, of_types, overload
 
+# How long a topic may be without publisher or message before that is logged. Where an announcement
+# was lost, as on a busy machine, DDS repeats it after 3 s only.
 DISCOVERY_S = 5.0
-"""How long a topic may be without publisher or message before that is logged.
 
-Where an announcement was lost, as on a busy machine, DDS repeats it after 3 s only.
-"""
+WELL_S = 1.0  # how long a topic on which messages come is not looked at again
 
-WELL_S = 1.0
-"""How long a topic on which messages come is not looked at again."""
-
+# How long a node that should look at its topics four times a second must not have done so.
 HELD_UP_S = 1.0
-"""How long a node that should look at its topics four times a second must not have done so."""
 
 MAX_FULL_NAMES = 3  # of message types in a log line
 
 Decoder: TypeAlias = Callable[[Buffer, int], Any]
 
+# How long a type that has not come yet is waited for while others are published as well.
 TRY_S = 2.0
-"""How long a type that has not come yet is waited for while others are published as well."""
 
-KEEP_S = 5.0
-"""How long a type that has come before must be silent until another one is tried."""
+KEEP_S = 5.0  # how long a type that has come before must be silent until another one is tried
 
 
 class TypeChoice:

@@ -62,6 +62,7 @@ def numbers(given: Mapping[str, str], name: str, count: int) -> list[float]:
     return values
 
 
+# Launch arguments beside params_file: default and description.
 ARGUMENTS = {
     'namespace': ('', 'namespace of the robot'),
     'use_sim_time': ('false', 'whether /clock gives the time'),
@@ -82,7 +83,6 @@ ARGUMENTS = {
     'tag_size': ('', 'edge of square tags, metres; empty: as params_file says'),
     'map': ('', 'occupancy grid for a map server, a YAML file; empty: none is started'),
 }
-"""Launch arguments beside params_file: default and description."""
 
 EXECUTABLE, NAME = 'lifecycle_observer_node', 'observer_node'
 

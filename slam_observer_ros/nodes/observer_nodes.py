@@ -52,8 +52,8 @@ from slam_observer_ros.settings.parameter_table import changed_names, table
 
 RETRY_PERIOD_S = 0.02
 
+# Inputs that are cheap to use, and move the estimate on to the present.
 MOTION_INPUTS = ('twist', 'imu')
-"""Inputs that are cheap to use, and move the estimate on to the present."""
 
 
 class DataFlow:
@@ -200,8 +200,8 @@ DIAGNOSTICS_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
 KEEP_PERIOD_S = 2.0
 
+# /clock may step back by less without having jumped, nanoseconds: messages are then just late.
 CLOCK_JITTER_NS = 100_000_000
-"""/clock may step back by less without having jumped, nanoseconds: messages are then just late."""
 
 
 class ObserverCore:
@@ -341,8 +341,8 @@ class ObserverCore:
 
 
 TOPIC = 'bond'
+# After which without a heartbeat the manager is given up; as Nav2's own nodes have it.
 TIMEOUT_S = 4.0
-"""After which without a heartbeat the manager is given up; as Nav2's own nodes have it."""
 
 
 class LifecycleBond:

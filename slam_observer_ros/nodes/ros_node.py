@@ -52,8 +52,7 @@ from slam_observer_ros.settings.parameter_table import (
     table,
 )
 
-REPORT_PERIOD_S = 10.0
-"""Shortest time between two lines about one subject."""
+REPORT_PERIOD_S = 10.0  # shortest time between two lines about one subject
 
 
 class ThrottledLog:
@@ -306,18 +305,17 @@ def install_command(package: str) -> str:
     return f'apt install ros-{distribution}-{package.replace("_", "-")}'
 
 
+# Makes what the nodes publish.
 MESSAGES = OutgoingMessages(message_class, lambda data: array('B', data))
-"""Makes what the nodes publish."""
 
 
-RELIABLE_QOS = QoSProfile(depth=10)
-"""Out: any subscriber fits a reliable publisher."""
+RELIABLE_QOS = QoSProfile(depth=10)  # out: any subscriber fits a reliable publisher
 
+# Out: as AMCL's pose; a late subscriber gets the last ones, as many as it keeps itself.
 LATCHED_POSE_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Out: as AMCL's pose; a late subscriber gets the last ones, as many as it keeps itself."""
 
+# Out: a subscriber that comes late gets the last message.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Out: a subscriber that comes late gets the last message."""
 
 
 def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:

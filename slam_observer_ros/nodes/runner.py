@@ -28,8 +28,8 @@ try:
 except ImportError:  # rclpy before 7.1.4
     EventsExecutor = None
 
+# What a node may raise at its start; the last one of what rclpy declares, as use_sim_time.
 REFUSALS = (SlamObserverError, InvalidParameterValueException, InvalidParameterTypeException)
-"""What a node may raise at its start; the last one of what rclpy declares, as use_sim_time."""
 
 USAGE = """\
 usage: ros2 run slam_observer_ros NODE [--ros-args [-p NAME:=VALUE] [--params-file FILE]
@@ -39,11 +39,10 @@ docs/topics.md lists the topics and services of observer_node, docs/parameters.m
 of a running node `ros2 param list` does.
 """
 
-STOP_LATENCY_S = 0.1
-"""Longest time that an idle node takes to notice a signal."""
+STOP_LATENCY_S = 0.1  # longest time that an idle node takes to notice a signal
 
+# How long a node may take to end by itself, as within a long computation; launch waits 5 s.
 PATIENCE_S = 1.2
-"""How long a node may take to end by itself, as within a long computation; launch waits 5 s."""
 
 
 def run(

@@ -35,8 +35,8 @@ from slam_observer_ros.nodes.ros_node import RELIABLE_QOS
 from slam_observer_ros.nodes.transforms import TransformedOdometry
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
+# Time between two velocities, nanoseconds, whose stamps are believed at once.
 MAX_STEP_NS = 500_000_000
-"""Time between two velocities, nanoseconds, whose stamps are believed at once."""
 
 
 class PausedMotion:
@@ -150,11 +150,10 @@ class ControlServices:
         )
 
 
+# How many times as long as it took the map at hand is kept before it is made again.
 RECENT_PERIODS = 20.0
-"""How many times as long as it took the map at hand is kept before it is made again."""
 
-END_S = 0.2
-"""For how long, at the end, events that are held back are begun with."""
+END_S = 0.2  # for how long, at the end, events that are held back are begun with
 
 
 class MapServices:

@@ -33,8 +33,8 @@ COMPILED = compiled('smoothing._gauss_newton')
 
 STRIDE = 8
 
+# Size of a border which, carried along the whole chain, costs less than a detour.
 SMALL_BORDER = 100
-"""Size of a border which, carried along the whole chain, costs less than a detour."""
 
 
 class Equations(NamedTuple):

@@ -58,8 +58,7 @@ class Step:
         return self.factors.marginal()
 
 
-MOST_HALVED = 8
-"""Times at most that a step is halved."""
+MOST_HALVED = 8  # times at most that a step is halved
 
 
 class Smoother:

@@ -24,8 +24,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.lie.matrices import definite_inverse
 from slam_observer_ros.lie.sensor_mounting import joined_sensed, Sensed
 
-EXACT_M = 1e-6
-"""Standard deviation of a position that is said to be exact, metres."""
+EXACT_M = 1e-6  # standard deviation of a position that is said to be exact, metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,8 +204,8 @@ def joined_turns(parts: list[SeenTurns], counts: list[int]) -> SeenTurns:
     )
 
 
+# Times, at most, that it is asked which slips pay; the answer hardly changes after the third.
 ROUNDS = 10
-"""Times, at most, that it is asked which slips pay; the answer hardly changes after the third."""
 
 
 def confirmed_slips(

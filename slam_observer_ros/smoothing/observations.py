@@ -33,11 +33,11 @@ from slam_observer_ros.lie.sensor_mounting import (
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 
+# What C reads of the sensors of M points, see :meth:`SensedPoints.flat`.
 FlatSensed: TypeAlias = tuple[IntArray, FloatArray, FloatArray, FloatArray, IntArray]
-"""What C reads of the sensors of M points, see :meth:`SensedPoints.flat`."""
 
+# The same where none is calibrated.
 NO_SENSORS = None, None, None, np.empty((0, 7)), np.empty((0, 7), dtype=np.int64)
-"""The same where none is calibrated."""
 
 
 class SensedPoints:

@@ -15,8 +15,7 @@ from slam_observer_ros.lie.axes import EstimatedAxes
 from slam_observer_ros.lie.matrices import solve_definite, transpose
 from slam_observer_ros.smoothing.keyframes import EXACT_M
 
-ANYWHERE_M = 1e3
-"""Standard deviation of an unknown landmark, metres."""
+ANYWHERE_M = 1e3  # standard deviation of an unknown landmark, metres
 
 
 @dataclass(frozen=True, slots=True)

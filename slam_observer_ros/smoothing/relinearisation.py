@@ -46,48 +46,40 @@ from slam_observer_ros.smoothing.prior import Prior
 
 logger = logging.getLogger(__name__)
 
+# Share of all observations so far that are relinearised at once at least, up to ``MAX_INTERVAL``.
+# A large map takes many observations. So many share the cost, O(n³) for n landmarks, that each of
+# them costs no more than an update, O(n²).
 SHARE_OF_HISTORY = 0.1
-"""Share of all observations so far that are relinearised at once at least, up to ``MAX_INTERVAL``.
 
-A large map takes many observations. So many share the cost, O(n³) for n landmarks, that each of
-them costs no more than an update, O(n²).
-"""
+MAX_INTERVAL = 300  # observations that are enough, however many there were before
 
-MAX_INTERVAL = 300
-"""Observations that are enough, however many there were before."""
-
+# Keyframes that are kept for landmarks that may enter: as many cost some milliseconds.
 MOST_AWAITED = 1000
-"""Keyframes that are kept for landmarks that may enter: as many cost some milliseconds."""
 
+# Most unknowns of a map that is relinearised, in some tenths of a second: 100 tags in space.
 MAX_UNKNOWNS = 600
-"""Most unknowns of a map that is relinearised, in some tenths of a second: 100 tags in space."""
 
 NO_HISTORY = "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
 
 CUT = 'the history was cut (smoothing_window=0 keeps all of it)'
 
-MAX_TURN_RAD = 0.2
-"""Angle, see :meth:`.Prior.least_nonlinear`, beyond which there is no summary."""
+MAX_TURN_RAD = 0.2  # angle, see :meth:`.Prior.least_nonlinear`, beyond which there is no summary
 
+# Share of the observations otherwise waited for that will do after a single large correction:
+# until then observations are linearised at the wrong estimate.
 EARLY_SHARE = 0.1
-"""Share of the observations otherwise waited for that will do after a single large correction:
-until then observations are linearised at the wrong estimate.
-"""
 
+# Steps at most; change of pose and map, rad and m, below which one will do.
 ITERATIONS, TOLERANCE = 2, 2e-2
-"""Steps at most; change of pose and map, rad and m, below which one will do."""
 
+# Steps at most where a landmark enters, by which all since it was seen first is corrected.
 ENTRY_ITERATIONS = 10
-"""Steps at most where a landmark enters, by which all since it was seen first is corrected."""
 
+# Steps at most to see where a landmark is, and by how much one has to be better at least.
 PLACING_ITERATIONS, COST_TOLERANCE = 40, 0.1
-"""Steps at most to see where a landmark is, and by how much one has to be better at least."""
 
-SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
-"""The same for smoothing everything."""
-
-SLIP_TOLERANCE = 1e-4
-"""Change below which a solution will do to judge slips by."""
+SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6  # the same for smoothing everything
+SLIP_TOLERANCE = 1e-4  # change below which a solution will do to judge slips by
 
 
 class Placed(NamedTuple):
