@@ -26,7 +26,6 @@ from slam_observer_ros.messages.poses import (
     decode_odometry_pose,
     decode_transforms,
     ODOMETRY,
-    PoseMessage,
     TRANSFORMS,
 )
 from slam_observer_ros.messages.registry import Decode, decoders
@@ -44,36 +43,32 @@ from slam_observer_ros.settings.node_settings import (
     Role,
 )
 
-QUEUE_DEPTH = 100  # messages of an input that are kept while the node is busy
+# Any publisher is heard by it; so many messages of an input are kept while the node is busy.
+QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def open_inputs(
     node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
 ) -> list[InputTopic]:
     """Subscribe to what the parameters name; ParameterError if a type's package is missing."""
-    velocity = _velocity_input(node, settings, feed)
-    landmarks = _landmark_input(node, settings, feed)
-    imu: list[InputTopic] = []
-    if settings.use_imu:
-        of_imu = decoders('angular velocity')
-        imu.append(InputTopic(node, 'imu', of_imu, partial(feed.add, 'imu'), _qos()))
-    velocity.read_first, landmarks.read_first = imu, [velocity, *imu]
-    return [velocity, landmarks, *imu]
-
-
-def _velocity_input(node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed) -> InputTopic:
+    chosen = _chosen('velocity', settings.velocity_type)
     if settings.velocity_source == POSE_DIFFERENCES:
         if settings.velocity_type not in (AUTO, 'Odometry'):
             raise ParameterError(
                 f"velocity_type '{settings.velocity_type}' has no poses: with velocity_source "
                 "'pose_differences' it is 'Odometry' or 'auto'"
             )
-        chosen: dict[str, Any] = {ODOMETRY: decode_odometry_pose}
-    else:
-        chosen = _chosen('velocity', settings.velocity_type)
-        if ODOMETRY in chosen:
-            chosen[ODOMETRY] = OdometryDecoder(node, not settings.use_imu)
-    return InputTopic(node, 'twist', chosen, partial(feed.add, 'twist'), _qos())
+        chosen = {ODOMETRY: decode_odometry_pose}
+    elif ODOMETRY in chosen:
+        chosen[ODOMETRY] = OdometryDecoder(node, not settings.use_imu)
+    velocity = InputTopic(node, 'twist', chosen, partial(feed.add, 'twist'), QOS)
+    landmarks = _landmark_input(node, settings, feed)
+    imu: list[InputTopic] = []
+    if settings.use_imu:
+        of_imu = decoders('angular velocity')
+        imu.append(InputTopic(node, 'imu', of_imu, partial(feed.add, 'imu'), QOS))
+    velocity.read_first, landmarks.read_first = imu, [velocity, *imu]
+    return [velocity, landmarks, *imu]
 
 
 def _landmark_input(node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed) -> InputTopic:
@@ -89,7 +84,7 @@ def _landmark_input(node: Node, settings: ObserverNodeSettings, feed: EstimatorF
             chosen[cloud] = CloudDecoder(node, cloud)
         if not any(map(is_installed, chosen)):
             message_class(next(iter(chosen)))  # raises, and says what to install
-    topic = InputTopic(node, name, chosen, take, _qos(), settings.landmarks_max_wait)
+    topic = InputTopic(node, name, chosen, take, QOS, settings.landmarks_max_wait)
     topic.is_shared = True
     topic.advice = {
         message_type: f'landmarks_type: {known.short_name}'
@@ -105,11 +100,6 @@ def _chosen(role: Role, type_choice: str) -> dict[str, Any]:
         for name, known in message_types(role).items()
         if type_choice in (AUTO, known.short_name)
     }
-
-
-def _qos() -> QoSProfile:
-    """Return a profile by which any publisher is heard."""
-    return QoSProfile(depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero
@@ -131,30 +121,24 @@ class CloudDecoder:
     def __call__(self, raw: Buffer, receive_ns: int) -> ObservationEvent:
         """Decode a cloud."""
         event = self._decode(raw, receive_ns)
-        if not self._is_checked and len(event.ids) and (event.ids == UNKNOWN_ID).all():
-            self._is_checked = True
-            self._check(raw)
-        return event
-
-    def _check(self, raw: Buffer) -> None:
+        if self._is_checked or not len(event.ids) or (event.ids != UNKNOWN_ID).any():
+            return event
+        self._is_checked = True
         names = read_fields(raw, self._message_type).names
-        missing = missing_ids(names, self._message_type)
-        if missing:
+        if missing := missing_ids(names, self._message_type):
             topic = self._node.resolve_topic_name('landmarks')
             self._node.get_logger().warning(
                 f"points on '{topic}' come {missing}: they are distinguished by where they are; "
                 f"if they have ids, name these '{ID_NAME}'"
             )
+        return event
 
 
 class OdometryDecoder:
     """Decodes velocities of odometries; warns once if their poses move otherwise.
 
-    Attributes
-    ----------
-    doubt : Finding or None
-        What is wrong with them; None until it is seen, and, where all were zero, once one is not.
-
+    ``doubt`` is what is wrong with them: None until it is seen, and, where all were zero, once one
+    is not.
     """
 
     def __init__(self, node: Node, uses_turn: bool = True) -> None:
@@ -168,25 +152,18 @@ class OdometryDecoder:
     def __call__(self, raw: Buffer, receive_ns: int) -> VelocityEvent:
         """Decode the velocity of a nav_msgs/Odometry."""
         pose, velocity = decode_odometry(raw)
-        if not self._gives_velocities:
-            self._look_for_velocities(pose, velocity)
-        elif not self._check.is_decided:
-            self._check.add(pose, velocity)
-            if self._check.problem:
-                self._warn(self._check.problem)
-        return velocity
-
-    def _look_for_velocities(self, pose: PoseMessage, event: VelocityEvent) -> None:
-        # One that has given a velocity will do so again.
-        self._gives_velocities = bool(event.body_velocity.any())
         if self._gives_velocities:
-            self.doubt = None
-        if self._gives_velocities or self.doubt or pose.problem:  # nobody asked for its pose
-            return
-        if self._first is None:
-            self._first = pose.position
-        if np.linalg.norm(pose.position - self._first) > MOVED_M:
-            self._warn()
+            if not self._check.is_decided:
+                self._check.add(pose, velocity)
+                if self._check.problem:
+                    self._warn(self._check.problem)
+        elif velocity.body_velocity.any():  # and it will do so again
+            self._gives_velocities, self.doubt = True, None
+        elif not (self.doubt or pose.problem):  # nobody asked for its pose
+            self._first = pose.position if self._first is None else self._first
+            if np.linalg.norm(pose.position - self._first) > MOVED_M:
+                self._warn()
+        return velocity
 
     def _warn(self, problem: str = '') -> None:
         self.doubt = of_twist(f"'{self._topic}'", problem)

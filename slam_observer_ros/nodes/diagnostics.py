@@ -78,11 +78,11 @@ class LocalisationStatus:
         """What is wrong with the noise that is stated."""
         return self._noise.findings
 
-    def status(self, hardware_id: str, findings: Iterable[Finding]) -> DiagnosticStatus:
+    def status(self, hardware_id: str, unexplained: Sequence[Finding]) -> DiagnosticStatus:
         """Return the status for /diagnostics, with those findings that nothing else explains."""
         level, message = localisation(self._estimator, self._settings)
-        for finding in findings:
-            if finding.level >= Level.WARNING:
+        for finding in self._noise.findings:
+            if finding in unexplained and finding.level >= Level.WARNING:
                 level = max(level, Level.WARNING)
                 message = f'{message}; {finding.what}'
         known = ['unknown'] * 2
@@ -117,25 +117,16 @@ PAUSE_S = 60.0
 
 
 class MistakeWatch:
-    """Keeps the events of late, and searches them for a mistake while there is reason for that.
-
-    Attributes
-    ----------
-    findings : list of Finding
-        What the last search has named.
-    timer : Timer
-        It runs only while a search goes on.
-
-    """
+    """Keeps the events of late, and searches them for a mistake while there is reason for that."""
 
     def __init__(self, node: Node, estimator: Estimate, begin_search: type[Search]) -> None:
-        self.findings: list[Finding] = []
+        self.findings: list[Finding] = []  # what the last search has named
         self._node = node
         self._estimator, self._begin_search = estimator, begin_search
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._search: Search | None = None
         self._next_s = 0.0
-        self.timer = node.create_steady_timer(PERIOD_S, self._advance)
+        self.timer = node.create_steady_timer(PERIOD_S, self._advance)  # while a search goes on
         self.timer.cancel()
 
     def note(self, event: Event) -> None:
@@ -227,8 +218,20 @@ class DiagnosticsPublisher:
             is_paused=self._feed.is_paused,
             has_seen=self._seen_s is not None,
         )
-        unreadable = self._numbers(self._new('malformed', malformed))
-        symptoms = of_node(self._estimator, unreadable, progress)
+        unreadable = self._new('malformed', malformed)
+        numbers = [
+            InputNumbers(
+                source.name,
+                source.topic,
+                source.received,
+                source.silent_s,
+                source.problem,
+                source.doubt,
+                source.last_malformed if unreadable[source.topic] else None,
+            )
+            for source in self._inputs
+        ]
+        symptoms = of_node(self._estimator, numbers, progress)
         for finding in symptoms:
             if finding.kind == 'empty_messages' and not self._said_empty:
                 self._said_empty = True
@@ -258,8 +261,7 @@ class DiagnosticsPublisher:
             message=in_brief(problems) or 'running',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
-        of_fit = [each for each in self._localisation.findings if each in of_both]
-        localisation = self._localisation.status(self._hardware_id, of_fit)
+        localisation = self._localisation.status(self._hardware_id, of_both)
         message = DiagnosticArray(status=[status, localisation])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
@@ -269,21 +271,6 @@ class DiagnosticsPublisher:
         before = self._last.get(what, Counter())
         self._last[what] = counts.copy()
         return counts - before
-
-    def _numbers(self, unreadable: Counter[str]) -> list[InputNumbers]:
-        """Return what is known of the inputs; of ``unreadable`` ones, also what was wrong."""
-        return [
-            InputNumbers(
-                source.name,
-                source.topic,
-                source.received,
-                source.silent_s,
-                source.problem,
-                source.doubt,
-                source.last_malformed if unreadable[source.topic] else None,
-            )
-            for source in self._inputs
-        ]
 
     def _input_values(self, elapsed_s: float) -> dict[str, str]:
         values = {}

@@ -81,7 +81,6 @@ TOPICS = (
     'markers',
 )
 
-
 # Odometry on /tf may be post-dated a little, so that it holds until the next one.
 MAX_AHEAD_S = 0.25
 
@@ -107,7 +106,7 @@ class EstimatePublisher:
         self._estimator = estimator
         self._messages = EstimateMessages(MESSAGES, settings.map_frame)
         self._state = StateMessages(settings.map_frame, settings.base_frame)
-        self._pace = Pace(settings.publish_rate)
+        self.pace = Pace(settings.publish_rate)
         self._fast_stamp_ns: int | None = None
         self._slow_stamp_ns: int | None = None
         self._path: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
@@ -146,13 +145,8 @@ class EstimatePublisher:
         age_s = self.odometry_age_s
         if age_s is None or age_s > -MAX_AHEAD_S:
             return ''
-        settings = self._settings
-        text = fault(
-            'odometry_ahead',
-            odom_frame=settings.odom_frame,
-            base_frame=settings.base_frame,
-            ahead_s=-age_s,
-        )
+        frames = {'odom_frame': self._settings.odom_frame, 'base_frame': self._settings.base_frame}
+        text = fault('odometry_ahead', **frames, ahead_s=-age_s)
         self._log.warning('early odometry', text)
         return text
 
@@ -165,10 +159,6 @@ class EstimatePublisher:
         self._log.warning(topic, finding.text())
         return finding.text()
 
-    def is_due(self, source: str) -> bool:
-        """Whether ``publish_rate`` allows to publish now what an input has given; '' for none."""
-        return self._pace.is_due(source)
-
     @property
     def is_waiting(self) -> bool:
         """Whether there is something to publish, once it is due or the odometry is there."""
@@ -180,9 +170,11 @@ class EstimatePublisher:
         if self.broadcaster is not None:
             self.broadcaster.retry()
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None or not (self._is_new(self._fast_stamp_ns) and self.is_due(source)):
+        if stamp_ns is None or not self._is_new(self._fast_stamp_ns):
             return
-        self._pace.note(source)
+        if not self.pace.is_due(source):
+            return
+        self.pace.note(source)
         self._fast_stamp_ns = stamp_ns
         pose = self._publish_pose(stamp_ns)
         if self.broadcaster is not None:
@@ -267,11 +259,8 @@ class EstimatePublisher:
 
     def _publish_landmarks(self, stamp_ns: int) -> None:
         estimator = self._estimator
-        landmarks = (
-            estimator.landmark_ids,
-            estimator.world_points,
-            estimator.landmark_covariances,
-        )
+        points, covariances = estimator.world_points, estimator.landmark_covariances
+        landmarks = estimator.landmark_ids, points, covariances
         velocities = estimator.landmark_velocities
         self._map.publish(self._messages.landmarks(stamp_ns, *landmarks, velocities))
         if self._markers.get_subscription_count() > 0:

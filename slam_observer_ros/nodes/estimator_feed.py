@@ -119,32 +119,9 @@ class ClockChange:
 class EstimatorFeed:
     """Gives what comes in to the estimator, in the base frame and in this machine's time.
 
-    Parameters
-    ----------
-    node : Node
-    settings : ObserverNodeSettings
-    estimator : Estimator
-    base_frame : BaseFrame
-    on_events : callable
-        Called after events were used, with the name of the input that gave them; '' for several.
-    on_waiting : callable
-        Called when something begins to wait: :meth:`retry` is to be called often from then on.
-    note_event : callable
-        Called with each event that the estimator gets.
-
-    Attributes
-    ----------
-    dropped : Counter
-        Messages that did not become events, by reason.
-    unstamped : Counter
-        Messages without a stamp, by topic.
-    clocks : dict of str to ClockOffset
-        How far off the stamps are, by input.
-    is_active : bool
-        Else all that comes in is ignored.
-    is_paused : bool
-        Whether all that comes in is dropped and counted.
-
+    ``on_events`` is called after events were used, with the name of the input that gave them, ''
+    for several; ``on_waiting`` when something begins to wait: :meth:`retry` is to be called often
+    from then on; ``note_event`` with each event that the estimator gets.
     """
 
     def __init__(
@@ -170,8 +147,9 @@ class EstimatorFeed:
         self._log = ThrottledLog(node)
         self._processing_s = 0.0
         self._processed = 0
-        self.dropped: Counter[str] = Counter()
-        self.unstamped: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()  # messages that became no events, by reason
+        self.unstamped: Counter[str] = Counter()  # messages without a stamp, by topic
+        # How far off the stamps are, by input
         self.clocks = {
             name: ClockOffset(to_ns(settings.max_clock_offset)) for name in SOURCES.values()
         }
@@ -181,8 +159,8 @@ class EstimatorFeed:
         self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
         if settings.landmarks_type == ON_TF:
             self._topics['landmarks'] = f"'{node.resolve_topic_name('/tf')}'"
-        self.is_active = False
-        self.is_paused = False
+        self.is_active = False  # else all that comes in is ignored
+        self.is_paused = False  # whether all that comes in is dropped and counted
         self.on_events, self._on_waiting = on_events, on_waiting
         self._note_event = note_event
 

@@ -53,21 +53,13 @@ class TypeChoice:
 
     A topic can be heard with one type at a time. A publisher may be silent for ever, as a
     teleoperation that nobody uses, so that being published does not show which type flows.
-
-    Attributes
-    ----------
-    chosen : str
-        The type that is listened for; '' before the first.
-    have_come : set of str
-        Types of which there was a message.
-
     """
 
     def __init__(self) -> None:
-        self.chosen = ''
+        self.chosen = ''  # the type that is listened for; '' before the first
         self._since_s = 0.0
         self._tried: set[str] = set()
-        self.have_come: set[str] = set()
+        self.have_come: set[str] = set()  # types of which there was a message
 
     def choose(self, type_name: str, now_s: float) -> bool:
         """Note that a type is listened for; return whether it is for the first time."""
@@ -111,23 +103,14 @@ class Waiting:
 class LoadShedding:
     """Drops old messages once one has waited too long, so that an estimate does not age.
 
-    Parameters
-    ----------
-    max_wait_s : float
-        How long messages may wait to be read, seconds. If one has waited longer, only the newest
-        of each sensor is used.
-
-    Attributes
-    ----------
-    shed : int
-        Messages dropped so far.
-
+    If one has waited for longer than ``max_wait_s`` seconds to be read, only the newest of each
+    sensor is used.
     """
 
     def __init__(self, max_wait_s: float) -> None:
         self._max_wait_s = max_wait_s
         self._recent: deque[tuple[float, int, int]] = deque()
-        self.shed = 0
+        self.shed = 0  # messages dropped so far
 
     def newest(self, waiting: Sequence[Waiting], now_ns: int, now_s: float) -> list[Waiting]:
         """Return which of the messages that wait, in order of reception, are to be used.
@@ -179,28 +162,6 @@ class InputTopic:
         How long messages may wait before only the newest of each sensor is used, seconds; by
         default all are used.
 
-    Attributes
-    ----------
-    topic : str
-        Topic name after remapping.
-    received, malformed : int
-        Messages so far, and how many could not be decoded.
-    last_malformed : Finding or None
-        What was wrong with the last one of these.
-    shedding : LoadShedding
-        What is dropped, and how much was, as they come faster than they can be used.
-    advice : mapping of str to str
-        Which parameter would make other message types that may be found be read.
-    has_more : bool
-        Whether messages were taken that are still to be used: all else that waits came later.
-    is_shared : bool
-        Whether several may publish on it, as several sensors of landmarks.
-    read_first : sequence of InputTopic
-        Other inputs: what they received before a message of this one is read before it.
-        An executor reads one message of each topic in turn, so after the node was busy a slow
-        topic would run far ahead of a fast one. It still does where the middleware does not
-        report when it has received a message.
-
     """
 
     def __init__(
@@ -216,9 +177,13 @@ class InputTopic:
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
+        # Whether messages were taken that are still to be used: all else that waits came later.
         self.has_more = False
-        self.is_shared = False
-        self.advice: Mapping[str, str] = {}
+        self.is_shared = False  # whether several may publish on it, as several sensors
+        self.advice: Mapping[str, str] = {}  # parameters by which other types would be read
+        # Inputs of which all is read that they received before a message of this one: an executor
+        # reads one message of each topic in turn, so after the node was busy a slow topic would
+        # run far ahead of a fast one. It still does where the middleware gives no such time.
         self.read_first: Sequence[InputTopic] = ()
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
@@ -228,7 +193,7 @@ class InputTopic:
         self.name = name
         self.topic = node.resolve_topic_name(name)
         self.received = 0
-        self.malformed = 0
+        self.malformed = 0  # of these, what could not be decoded
         self.last_malformed: Finding | None = None
         self._fault = ''
         self.backlog = Backlog()
@@ -408,7 +373,13 @@ class InputTopic:
     def _decode(self, raw: bytes, info: Mapping[str, int]) -> list[Waiting]:
         """Return a message, decoded, in a list; none if it can't be."""
         self._received_ns = info['received_timestamp']
-        receive_ns = self._reception_ns(self._received_ns)
+        # Not now: while the node is busy messages wait, as the system clock shows. A simulated
+        # clock only has the present time, and some middlewares give none but zero.
+        clock = self._node.get_clock()
+        if has_time := self._received_ns > 0:
+            self.backlog.add(to_s(time.time_ns() - self._received_ns), time.monotonic())
+        is_of_ros = has_time and not clock.ros_time_is_active
+        receive_ns = self._received_ns if is_of_ros else int(clock.now().nanoseconds)
         self.received += 1
         self.last_received_s = time.monotonic()
         self._types.have_come.add(self._types.chosen)
@@ -425,17 +396,6 @@ class InputTopic:
             )
             return []
         return [Waiting(message, self._received_ns, receive_ns)]
-
-    def _reception_ns(self, received_ns: int) -> int:
-        """Return when a message was received, by the ROS clock."""
-        # That is not now: while the node is busy messages wait, as the system clock shows. A
-        # simulated clock only has the present time, and some middlewares give none but zero.
-        clock = self._node.get_clock()
-        if received_ns > 0:
-            self.backlog.add(to_s(time.time_ns() - received_ns), time.monotonic())
-            if not clock.ros_time_is_active:
-                return received_ns
-        return int(clock.now().nanoseconds)
 
     @property
     def _wanted(self) -> str:

@@ -48,7 +48,7 @@ from slam_observer_ros.runs.health import NoiseFit
 from slam_observer_ros.runs.mistakes import Search
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ManagedNodeSettings, ObserverNodeSettings
-from slam_observer_ros.settings.parameter_table import changed_names, table
+from slam_observer_ros.settings.parameter_table import changed_names, Dataclass, table
 
 RETRY_PERIOD_S = 0.02
 
@@ -62,27 +62,7 @@ class DataFlow:
     A message comes in on one of ``inputs``; ``feed`` gives it to ``estimator``, once ``buffer``
     places its sensor; and ``output`` publishes the new estimate, at once if it is due.
 
-    Parameters
-    ----------
-    node : GuardedNode
-    settings : ObserverNodeSettings
-    estimator_settings : Settings
-    on_update : callable
-        As of :class:`.Estimator`.
-
-    Attributes
-    ----------
-    buffer : TransformBuffer
-        What is known of /tf.
-    estimator : Estimator
-    output : EstimatePublisher
-    feed : EstimatorFeed
-    inputs : list of InputTopic
-    watch : MistakeWatch
-        Names a mistake of the set-up.
-    timers : list of Timer
-        They run only while something waits.
-
+    ``on_update`` is as of :class:`.Estimator`.
     """
 
     def __init__(
@@ -118,6 +98,7 @@ class DataFlow:
         period_s = 1.0 / settings.publish_rate
         self._publish_timer = node.create_steady_timer(period_s, self._publish_waiting)
         self._retry_timer = node.create_steady_timer(RETRY_PERIOD_S, self._retry)
+        # They run only while something waits
         self.timers = [self._publish_timer, self._retry_timer, self.watch.timer]
         self._is_catching_up = False
         window_s = estimator_settings.reorder_window
@@ -143,7 +124,7 @@ class DataFlow:
             return
         # With what is still to be used; a little later, if nothing comes of that.
         has_more = self._are_late_if_they_wait and any(each.has_more for each in self.inputs)
-        if not has_more and self.output.is_due(source):
+        if not has_more and self.output.pace.is_due(source):
             # What is published is not old: what waits is used, and published with it.
             self._is_catching_up = True
             self._read_waiting(but_landmarks=not self._are_late_if_they_wait)
@@ -381,16 +362,16 @@ class LifecycleBond:
             self._bond = None
 
 
-class ObserverNode(RepeatableParameters):
-    """Estimates from its start to its end."""
+class CoreNode(RepeatableParameters):
+    """A node with the observer in it, from when that is made to when it is closed."""
 
-    def __init__(self) -> None:
+    _core: ObserverCore | None = None
+    _bond: LifecycleBond | None = None
+
+    def __init__(self, *more_settings: type[Dataclass]) -> None:
         super().__init__('observer_node')
-        self._core: ObserverCore | None = None  # till it is made: rclpy may end a node before
         forward_logging(self.get_logger())
-        declare_settings(self, Settings, ObserverNodeSettings)
-        self._core = ObserverCore(self)
-        self._core.start()
+        declare_settings(self, Settings, ObserverNodeSettings, *more_settings)
 
     def end_in_haste(self) -> int | None:
         """See :meth:`.ObserverCore.end_in_haste`."""
@@ -399,13 +380,29 @@ class ObserverNode(RepeatableParameters):
     def destroy_node(self) -> None:
         """Save the map if that was asked for, and end; raise a MapError if it can't be saved."""
         try:
-            if self._core is not None:
-                self._core.close()
+            self._close()
         finally:
             super().destroy_node()
 
+    def _close(self) -> None:
+        bond, self._bond = self._bond, None
+        if bond is not None:
+            bond.end()
+        core, self._core = self._core, None
+        if core is not None:
+            core.close()
 
-class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignore[misc]
+
+class ObserverNode(CoreNode):
+    """Estimates from its start to its end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._core = ObserverCore(self)
+        self._core.start()
+
+
+class LifecycleObserverNode(CoreNode, LifecycleNode):  # type: ignore[misc]
     """Estimates while it is active.
 
     Configured, it has its topics, services and map; inactive, it drops what comes in and
@@ -413,11 +410,7 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
     """
 
     def __init__(self) -> None:
-        super().__init__('observer_node')
-        self._core: ObserverCore | None = None
-        self._bond: LifecycleBond | None = None
-        forward_logging(self.get_logger())
-        declare_settings(self, Settings, ObserverNodeSettings, ManagedNodeSettings)
+        super().__init__(ManagedNodeSettings)
         self._refuse_impossible_transitions()
         if not read_settings(self, ManagedNodeSettings).autostart_node:
             self.get_logger().info(
@@ -446,25 +439,11 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
         return self._attempt(self._stop)
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
-        """Save the map if that was asked for, and forget all."""
+        """Save the map if that was asked for, and forget all, also to end for good."""
         self._attempt(self._close)
         return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
-        """Save the map if that was asked for, and end for good."""
-        self._attempt(self._close)
-        return TransitionCallbackReturn.SUCCESS
-
-    def end_in_haste(self) -> int | None:
-        """See :meth:`.ObserverCore.end_in_haste`."""
-        return None if self._core is None else self._core.end_in_haste()
-
-    def destroy_node(self) -> None:
-        """End, whatever the state; raise a MapError if the map can't be saved."""
-        try:
-            self._close()
-        finally:
-            super().destroy_node()
+    on_shutdown = on_cleanup
 
     def _refuse_impossible_transitions(self) -> None:
         """Answer no to what the state does not allow; rclpy would end with a traceback."""
@@ -507,11 +486,3 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
         if self._core is not None and self._bond is not None:
             self._bond.end()
             self._core.stop()
-
-    def _close(self) -> None:
-        bond, self._bond = self._bond, None
-        if bond is not None:
-            bond.end()
-        core, self._core = self._core, None
-        if core is not None:
-            core.close()

@@ -127,20 +127,11 @@ def forward_logging(ros_logger: RcutilsLogger) -> None:
 
 
 class GuardedNode(Node):  # type: ignore[misc]  # rclpy comes untyped
-    """A node whose callbacks may fail: rclpy would end the process.
-
-    Attributes
-    ----------
-    failures : Counter
-        How often callbacks have failed, by what they were called for.
-    last_failure : str
-        What the last one has raised, and where; empty before the first.
-
-    """
+    """A node whose callbacks may fail: rclpy would end the process."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.failures: Counter[str] = Counter()
-        self.last_failure = ''
+        self.failures: Counter[str] = Counter()  # by what the callbacks were called for
+        self.last_failure = ''  # what the last one has raised, and where
         self._failure_log = ThrottledLog(self)
         self._steady_clock = SteadyClock(clock_type=ClockType.STEADY_TIME)
         super().__init__(*args, **kwargs)
@@ -368,24 +359,31 @@ class RepeatableParameters(GuardedNode):
 def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
     """Declare every row of the settings' tables; from then on each change is checked.
 
-    Names that are set but in no table are ignored with a warning: they may be other nodes'.
-
-    Raises
-    ------
-    ParameterError
-        If a name that is set is one of ours misspelt.
-    InvalidParameterValueException
-        If a value that is set does not fit its row.
-
+    Names that are set but in no table are ignored with a warning: they may be other nodes'. Raise
+    a ParameterError if one is ours, misspelt, and an InvalidParameterValueException if a value
+    that is set does not fit its row.
     """
     rows = [row for settings_class in settings_classes for row in table(settings_class)]
-    _check_names(node, [row.name for row in rows])
-    _warn_of_misplaced(node, [row.name for row in rows])
+    names = [row.name for row in rows]
+    # rclpy, unlike rclcpp, has no public name for what the command line and files set.
+    written = [
+        name
+        for name in sorted(node._parameter_overrides)
+        if not (node.has_parameter(name) or name.startswith('qos_overrides.'))
+    ]
+    if ignored := names_of_others(written, names):
+        node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
+    _warn_of_misplaced(node, names)
 
     def check(changes: Sequence[RosParameter]) -> SetParametersResult:
+        changed = {change.name: change.value for change in changes}
+        present = {row: node.get_parameter(row) for row in names if node.has_parameter(row)}
         try:
             for settings_class in settings_classes:
-                _check_changes(node, settings_class, changes)
+                own = [row.name for row in table(settings_class)]
+                values = {name: present[name].value for name in own if name in present}
+                values |= {name: changed[name] for name in own if name in changed}
+                from_parameters(settings_class, values)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -430,18 +428,6 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
     return result
 
 
-def _check_names(node: Node, names: Collection[str]) -> None:
-    """Raise ParameterError if a name that is set is misspelt; warn of names unlike any."""
-    # rclpy, unlike rclcpp, has no public name for what the command line and files set.
-    written = [
-        name
-        for name in sorted(node._parameter_overrides)
-        if not (node.has_parameter(name) or name.startswith('qos_overrides.'))
-    ]
-    if ignored := names_of_others(written, names):
-        node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
-
-
 def _warn_of_misplaced(node: Node, names: Collection[str]) -> None:
     """Warn of files on the command line whose parameters have the name of another node."""
     full_name = node.get_fully_qualified_name()
@@ -459,13 +445,3 @@ def _warn_of_misplaced(node: Node, names: Collection[str]) -> None:
                 f"parameter file {path} has nothing for '{full_name}'; are the values "
                 f"under '{sections[0]}' meant for it?"
             )
-
-
-def _check_changes(
-    node: Node, settings_class: type[Dataclass], changes: Sequence[RosParameter]
-) -> None:
-    """Raise ParameterError unless the settings with these changes are whole and in range."""
-    names = [row.name for row in table(settings_class)]
-    values = {name: node.get_parameter(name).value for name in names if node.has_parameter(name)}
-    values.update({change.name: change.value for change in changes if change.name in names})
-    from_parameters(settings_class, values)

@@ -142,12 +142,11 @@ class ControlServices:
 
     def _forget(self, message: Int64) -> None:
         self._estimator.release()  # else a sighting that is held back would bring it back
-        was_known = self._estimator.forget(message.data)
-        if was_known:
+        outcome = 'not known'
+        if self._estimator.forget(message.data):
             self._publisher.replace_landmarks()
-        self._node.get_logger().info(
-            f'landmark {message.data} is {"forgotten" if was_known else "not known"}'
-        )
+            outcome = 'forgotten'
+        self._node.get_logger().info(f'landmark {message.data} is {outcome}')
 
 
 # How many times as long as it took the map at hand is kept before it is made again.
@@ -160,15 +159,9 @@ class MapServices:
     """The map file of the start, ``~/load_map``, ``~/save_map`` and the autosave at the end.
 
     The node's parameter ``map_path`` names the services' file. ``on_load`` is called after a map
-    was loaded: the estimate is in another frame then.
-
-    Raises
-    ------
-    MapError
-        If the map of the start can't be read, or the map of the end could not be written.
-    ParameterError
-        If the map is to be saved at the end, but not where.
-
+    was loaded: the estimate is in another frame then. Raises a MapError if the map of the start
+    can't be read, or the map of the end could not be written, and a ParameterError if that is to
+    be saved, but not where.
     """
 
     def __init__(

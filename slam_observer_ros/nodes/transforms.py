@@ -39,17 +39,9 @@ TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCA
 class LiveTransforms:
     """Listens to /tf, /tf_static and camera_info; without tf2_msgs no transform is ever known.
 
-    Parameters
-    ----------
-    node : Node
-    buffer : TransformBuffer
-        Takes what is heard.
-    own : (str, str)
-        Parent and child of the transform that the node itself publishes where nobody else gives
-        the child a parent: heard back, it would replace another parent.
-    sent : PoseBroadcaster, optional
-        What is published from here; None if nothing is.
-
+    ``own`` are parent and child of the transform that the node itself publishes where nobody else
+    gives the child a parent: heard back, it would replace another parent. ``sent`` is what is
+    published from here, None if nothing is.
     """
 
     def __init__(
@@ -178,22 +170,8 @@ class PoseBroadcaster:
     frame, its correction goes out post-dated by ``transform_tolerance``, so that it holds until
     the next one, and by how long poses are held back, which has passed by then; while the observer
     is paused, the last correction is repeated. Odometry that begins later takes over. A frame is
-    never published twice with one stamp.
-
-    Parameters
-    ----------
-    node : Node
-    settings : ObserverNodeSettings
-    transforms : TransformBuffer
-        Where the odometry is, without what is published here.
-    reorder_window_s : float
-        How long poses are held back, seconds.
-
-    Attributes
-    ----------
-    problem : str
-        Why no correction goes out, or late ones do; empty while all is well.
-
+    never published twice with one stamp. ``transforms`` has the odometry, without what is
+    published here; poses are held back for ``reorder_window_s``.
     """
 
     def __init__(
@@ -221,7 +199,7 @@ class PoseBroadcaster:
         self._rival_s = -RIVAL_S
         self._rival = ''  # parent that it gives the frame
         self._static: dict[str, str] = {}  # parents of frames on /tf_static
-        self.problem = ''
+        self.problem = ''  # why no correction goes out, or late ones do
 
     @property
     def is_waiting(self) -> bool:
@@ -347,12 +325,8 @@ class PoseBroadcaster:
         return self._parent
 
     def _report(self, kind: str, **figures: object) -> None:
-        settings = self._settings
-        frames = {
-            'map_frame': settings.map_frame,
-            'odom_frame': settings.odom_frame,
-            'base_frame': settings.base_frame,
-        }
+        names = ('map_frame', 'odom_frame', 'base_frame')
+        frames = {name: getattr(self._settings, name) for name in names}
         self.problem = fault(kind, **frames, **figures)
         self._log.warning('/tf', self.problem)
 
