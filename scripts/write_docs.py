@@ -73,7 +73,8 @@ OUTPUTS = {
     'gains know them',
     'landmark_estimates': 'the same as PointCloud; not published if an id is 2²⁴ or more, beyond '
     'its float32',
-    'markers': 'for RViz and Foxglove: landmarks, residuals, circles for distances and lines for '
+    'markers': 'for RViz and Foxglove: landmarks (pink: elsewhere in another map that fits), '
+    'residuals, circles for distances and lines for '
     "directions alone, the first 200 landmarks' ids and 3σ ellipsoids; while the robot is lost in "
     'a map, arrows at the places that fit',
     'lyapunov': 'L (34) of the last observation',

@@ -11,6 +11,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from slam_observer_ros.common.findings import in_brief
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
@@ -260,6 +261,7 @@ class Ambiguity:
     until_ns: int
     position: FloatArray  # (3,) where the robot was shown at its beginning, metres, world
     probability: float  # least one, meanwhile, that the map shown was right
+    ids: IntArray  # (n,) landmarks of it that others of these maps had elsewhere, or had not
 
     @property
     def lasts_ns(self) -> int:
@@ -267,10 +269,12 @@ class Ambiguity:
         return self.until_ns - self.since_ns
 
     @property
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, float | str]:
         """What the finding ``ambiguous_map`` says of it: seconds, and metres in the world."""
         x, y, _ = self.position.tolist()
-        return {'lasts_s': to_s(self.lasts_ns), 'x': x, 'y': y, 'probability': self.probability}
+        ids = in_brief([str(i) for i in self.ids.tolist()], joint=', ') or 'seen once alone'
+        where = {'lasts_s': to_s(self.lasts_ns), 'x': x, 'y': y}
+        return where | {'probability': self.probability, 'ids': ids}
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,6 +316,8 @@ class Instant:
     landmark_covariances: FloatArray | None  # (n, 3, 3) world, m²
     calibration: tuple[CalibrationEstimate, ...]
     dropped: Counter[str]  # messages so far, by reason
+    # (d,) landmarks that other maps which fit have elsewhere, or have not
+    doubted_ids: IntArray
     seen: Update | None = None  # what was seen last, if that was lately
 
 

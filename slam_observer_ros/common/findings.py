@@ -257,7 +257,8 @@ _TEXTS = {
         'the velocity or of the points (Tune the noise)',
     'ambiguous_map':
         'what is seen without ids fits several maps for {lasts_s:.0f} s, from ({x:.1f} m, '
-        '{y:.1f} m) on: the one that is shown is right with a probability of {probability:.2f} → '
+        '{y:.1f} m) on: the one that is shown is right with a probability of {probability:.2f}, '
+        'and others differ in landmarks {ids} → '
         'drive to where more known landmarks are in view, or give some of them ids',
     'unconfirmed_map':
         '{waiting} landmarks without ids were seen too seldom to be sure that they exist, and '

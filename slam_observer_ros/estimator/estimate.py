@@ -91,6 +91,12 @@ class Estimate:
         return self._hypotheses.ambiguity
 
     @property
+    def doubted_ids(self) -> IntArray:
+        """Ids (d,) of landmarks that another map which fits has elsewhere, or has not."""
+        ambiguity = self.ambiguity
+        return np.empty(0, dtype=np.int64) if ambiguity is None else ambiguity.ids
+
+    @property
     def longest_ambiguity(self) -> Ambiguity | None:
         """The longest time in which it fitted several; None if it never did for long."""
         return self._hypotheses.longest_ambiguity

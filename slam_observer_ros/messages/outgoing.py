@@ -258,6 +258,7 @@ GREEN = (0.0, 0.62, 0.45, 1.0)  # red, green, blue, opacity
 WHITE = (1.0, 1.0, 1.0, 1.0)
 PALE_GREEN = (0.0, 0.62, 0.45, 0.3)
 ORANGE = (0.84, 0.37, 0.0, 1.0)
+PINK = (0.8, 0.47, 0.65, 1.0)
 
 SKY = (0.34, 0.71, 0.91, 0.8)
 
@@ -349,11 +350,12 @@ class MarkerMessages:
         points: FloatArray,
         covariances: FloatArray | None,
         update: Update | None,
+        doubted_ids: IntArray,
     ) -> Any:
         """Return markers that replace all earlier ones.
 
-        They are points, ids, the last residuals, distances and directions, and, where covariances
-        are known, ellipsoids.
+        They are points, those in doubt in another colour, ids, the last residuals, distances and
+        directions, and, where covariances are known, ellipsoids.
         """
         if not len(points):
             return self.none(stamp_ns)
@@ -367,7 +369,11 @@ class MarkerMessages:
         lines = self._residual_lines(header, ids, points, update)
         ellipsoids = self._ellipsoids(header, points, covariances)
         halves = [] if update is None else self._halves(header, ids, points, update)
-        drawn = [self._points(header, points), lines, *halves, *ellipsoids, *labels]
+        in_doubt = np.isin(ids, doubted_ids)
+        spheres = [self._points(header, 'landmarks', GREEN, points[~in_doubt])]
+        if in_doubt.any():
+            spheres.append(self._points(header, 'in doubt', PINK, points[in_doubt]))
+        drawn = [*spheres, lines, *halves, *ellipsoids, *labels]
         return self._array([self._removal(header), *drawn])
 
     def places(self, stamp_ns: int, poses: FloatArray) -> Any:
@@ -392,8 +398,10 @@ class MarkerMessages:
     def _removal(self, header: Any) -> Any:
         return self._marker(header, '', 0, WHITE, 0.0, action=DELETEALL)
 
-    def _points(self, header: Any, points: FloatArray) -> Any:
-        marker = self._marker(header, 'landmarks', SPHERE_LIST, GREEN, POINT_SIZE_M)
+    def _points(
+        self, header: Any, namespace: str, color: tuple[float, ...], points: FloatArray
+    ) -> Any:
+        marker = self._marker(header, namespace, SPHERE_LIST, color, POINT_SIZE_M)
         marker.points = [self._messages.point(point) for point in points]
         return marker
 

@@ -264,7 +264,8 @@ class EstimatePublisher:
         velocities = estimator.landmark_velocities
         self._map.publish(self._messages.landmarks(stamp_ns, *landmarks, velocities))
         if self._markers.get_subscription_count() > 0:
-            markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
+            last, doubted = estimator.last_update, estimator.doubted_ids
+            markers = self._messages.markers.landmarks(stamp_ns, *landmarks, last, doubted)
             self._markers.publish(markers)
 
     def _publish_estimates(self, stamp_ns: int) -> None:

@@ -186,6 +186,7 @@ def _instants(result: Result) -> dict[str, Json]:
         'ahead': rounded(poses[:, :3, 0], 3),
         'robot': [_covariances(None if P is None else P[None, 3:, 3:]) for P in of_poses],
         'ids': [instant.ids.tolist() for instant in some],
+        'in_doubt': [np.isin(i.ids, i.doubted_ids).nonzero()[0].tolist() for i in some],
         'points': [rounded(instant.world_points.T, 3) for instant in some],
         'covariances': [_covariances(instant.landmark_covariances) for instant in some],
         'rings': [rounded(rings, 3) for rings, _ in halves],

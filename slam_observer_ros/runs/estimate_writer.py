@@ -151,7 +151,8 @@ class EstimateWriter:
         landmarks = estimator.landmark_ids, points, estimator.landmark_covariances
         cloud = self._messages.landmarks(stamp_ns, *landmarks, velocities)
         self._write(MAP_TOPIC, cloud, stamp_ns, latched=True)
-        markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
+        last, doubted = estimator.last_update, estimator.doubted_ids
+        markers = self._messages.markers.landmarks(stamp_ns, *landmarks, last, doubted)
         self._write('/markers', markers, stamp_ns)
         status = diagnostics(self._writer.messages, stamp_ns, estimator, self._base_frame)
         self._write(DIAGNOSTICS_TOPIC, status, stamp_ns)

@@ -232,6 +232,7 @@ def _instant(estimator: Estimate, stamp_ns: int) -> Instant:
         landmark_covariances=estimator.landmark_covariances,
         calibration=tuple(estimator.calibration),
         dropped=estimator.dropped.copy(),
+        doubted_ids=estimator.doubted_ids,
         seen=None if is_late else last,
     )
 

@@ -60,6 +60,9 @@ which on they are several maps and not one.
 AMBIGUOUS_NS = 5_000_000_000
 """How long that has to last, nanoseconds: what the next views decide is no news."""
 
+DOUBTED = 0.05
+"""Probability from which on another map of a landmark is named beside that which is shown."""
+
 LEAST_DEVIATION = 0.01
 """Deviation of a pose, rad and m, within which poses are the same."""
 
@@ -349,11 +352,20 @@ class Hypotheses:
         present = self._present
         if present is None:
             position = self.best.observer.pose[:3, 3].copy()
-            present = Ambiguity(stamp_ns, stamp_ns, position, probability)
-        probability = min(present.probability, probability)
-        self._present = present = replace(present, until_ns=stamp_ns, probability=probability)
+            present = Ambiguity(stamp_ns, stamp_ns, position, 1.0, np.empty(0, dtype=np.int64))
+        if probability < present.probability:
+            present = replace(present, probability=probability, ids=self._doubted())
+        self._present = present = replace(present, until_ns=stamp_ns)
         if self._longest is None or present.lasts_ns > self._longest.lasts_ns:
             self._longest = present
+
+    def _doubted(self) -> IntArray:
+        """Return landmarks that likely hypotheses have elsewhere than the best, or have not."""
+        best = self.best
+        probabilities = np.zeros(len(best.landmarks))
+        for hypothesis, weight in zip(self._all[1:], self.weights[1:].tolist(), strict=True):
+            probabilities[_different(best, hypothesis.state)] += weight
+        return best.landmarks.ids[probabilities > DOUBTED]
 
     def _note_overthrow(self, shown: Hypothesis, path: Sequence[Branch], stamp_ns: int) -> None:
         """Note since when a map was wrong that was shown, and is not the most likely one now."""
@@ -363,7 +375,8 @@ class Hypotheses:
         if since is None or _off(best.state, shown.state) <= OVERTHROWN:
             return
         probability = 1.0 / (1.0 + math.exp(0.5 * min(max(shown.cost, 0.0), PRUNING_COST_OF_IDS)))
-        wrong = Ambiguity(since.stamp_ns, stamp_ns, since.position, probability)
+        ids = best.state.landmarks.ids[_different(best.state, shown.state)]
+        wrong = Ambiguity(since.stamp_ns, stamp_ns, since.position, probability, ids)
         if self._longest is None or wrong.lasts_ns > self._longest.lasts_ns:
             self._longest = wrong
 
@@ -582,11 +595,25 @@ def have_one_map(state: State, other: State) -> bool:
 
 def _agree(state: State, rows: IntArray, other: State, others: IntArray) -> bool:
     """Return whether a state expects landmarks (m,) where another one has them."""
+    return bool((_distances(state, rows, other, others) <= RESOLUTION).all())
+
+
+def _different(state: State, other: State) -> IntArray:
+    """Return rows of confirmed landmarks that another state has elsewhere, or has not."""
+    rows = state.confirmed
+    others = other.landmarks.rows_of(state.landmarks.ids[rows])
+    off, known = others < 0, others >= 0
+    off[known] = _distances(state, rows[known], other, others[known]) > RESOLUTION
+    return rows[off]
+
+
+def _distances(state: State, rows: IntArray, other: State, others: IntArray) -> FloatArray:
+    """Return how far from landmarks (m,) of a state another one has them, in σ of a view."""
     points = other.observer.body_points(others)
     seen = ObservationEvent(0, state.landmarks.ids[rows], points)
     noise, m = state.observation_noise.covariances(seen), len(rows)
     residuals = state.gains.residuals(rows, points, noise, np.zeros(m), np.ones(m))
-    return bool((state.gains.distances(residuals) <= RESOLUTION).all())
+    return state.gains.distances(residuals)
 
 
 def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:

@@ -626,7 +626,7 @@ class TestMarkers:
             kinds=np.array([BEARING, RANGE, POINT]),
         )
         drawn = MarkerMessages(ros.OUTGOING, 'map').landmarks(
-            0, np.array([4, 9, 7]), points, None, update
+            0, np.array([4, 9, 7]), points, None, update, np.array([7, 8])
         )
         by_namespace = {marker.ns: marker for marker in drawn.markers}
         ring = np.array([[p.x, p.y, p.z] for p in by_namespace['ranges'].points])
@@ -636,6 +636,11 @@ class TestMarkers:
         (start, end) = by_namespace['bearings'].points
         assert (start.x, start.y, start.z, end.x, end.y, end.z) == (0, 0, 0, 0, 2.5, 0)
         whole = MarkerMessages(ros.OUTGOING, 'map').landmarks(
-            0, np.array([4, 9, 7]), points, None, replace(update, kinds=None)
+            0, np.array([4, 9, 7]), points, None, replace(update, kinds=None), np.array([8])
         )
         assert {marker.ns for marker in whole.markers}.isdisjoint({'ranges', 'bearings'})
+        # Landmarks that another map which fits has elsewhere have another colour.
+        (doubted,), others = by_namespace['in doubt'].points, by_namespace['landmarks'].points
+        assert (doubted.x, doubted.y, doubted.z, len(others)) == (5.0, 5.0, 5.0, 2)
+        assert by_namespace['in doubt'].color != by_namespace['landmarks'].color
+        assert 'in doubt' not in {marker.ns for marker in whole.markers}

@@ -8,15 +8,18 @@ import json
 from pathlib import Path
 import re
 import shutil
+from unittest.mock import Mock
 
 from browser import open_page, Opened
+from nameless_points import creep, observe, stand
 import numpy as np
 import pytest
 from recordings import events, MESSAGE_COUNT, SAMPLE, write_events, write_mcap
 
 from slam_observer_ros import __version__
 from slam_observer_ros.cli.main import main
-from slam_observer_ros.events import BEARING, ObservationEvent, RANGE
+from slam_observer_ros.events import BEARING, Event, ObservationEvent, RANGE
+from slam_observer_ros.lie import se3
 from slam_observer_ros.recordings.writer import RecordingWriter
 from slam_observer_ros.runs.run_health import growth_windows
 
@@ -358,6 +361,32 @@ def test_distances_and_directions_alone_are_drawn(slam_observer, tmp_path, kind)
         assert 'distances, directions' in open_page(report).html
     else:
         np.testing.assert_allclose(instants['rays'][5], landmarks, atol=0.15)
+
+
+def test_landmarks_that_another_map_has_elsewhere_are_marked_while_it_fits(
+    slam_observer, tmp_path
+):
+    """Of two posts 3 m apart one is in view for ten seconds, then a third landmark decides."""
+    written, report = list[Event](), tmp_path / 'run.html'
+    drive = Mock(add=lambda event: written.append(event) or True)
+    posts = np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 6.0, 0.0]])
+    turned = se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0]))
+    for step in range(100):
+        creep(drive, 0.1 * step)
+        if step < 20:
+            observe(drive, 0.1 * step, posts)
+    for step in range(10, 26):
+        stand(drive, float(step))
+        seen = se3.transform(se3.inverse(turned), posts)
+        observe(drive, float(step), seen[1:2] if step < 20 else seen[1:])
+    options = ('two_d_mode=true', 'confirmations=1', 'angular_velocity_noise=[0.0, 0.0, 0.1]')
+    settings = [text for option in options for text in ('--set', option)]
+    recording = write_events(tmp_path / 'posts.mcap', written)
+    slam_observer('replay', recording, *settings, '--report', report)
+    instants = numbers_of(report)['instants']
+    marked = [t for t, rows in zip(instants['t'], instants['in_doubt'], strict=True) if rows]
+    assert marked == [15.0, 16.0, 17.0, 18.0, 19.0]
+    assert 'elsewhere in another map that fits' in open_page(report).html
 
 
 def test_moving_the_slider_moves_the_robot(report):

@@ -208,11 +208,16 @@ def test_it_says_since_when_and_where_what_is_seen_fits_several_maps(caplog):
     (finding,) = of_map_without_ids(estimator, ambiguity)
     assert finding.kind == 'ambiguous_map'
     assert f'for {ambiguity.lasts_ns * 1e-9:.0f} s, from (0.0 m, ' in finding.what
+    posts_ids = ', '.join(map(str, estimator.landmark_ids.tolist()))
+    assert f'others differ in landmarks {posts_ids}' in finding.what, 'as the robot sees them'
+    assert_array_equal(estimator.doubted_ids, estimator.landmark_ids)
     for step in range(20, 26):
         stand(estimator, float(step))
         observe(estimator, float(step), seen[1:])
     assert estimator.ambiguity is None
+    assert not len(estimator.doubted_ids)
     longest = estimator.longest_ambiguity
+    assert len(longest.ids)
     assert longest.since_ns <= ambiguity.since_ns, 'when the other one parted from it'
     assert longest.until_ns == 20 * 10**9, 'when the other one was shown in its place'
     assert longest.probability < 0.1

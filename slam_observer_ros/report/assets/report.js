@@ -69,7 +69,7 @@ function addEllipse(x, y, [xx, xy, xz, yy, yz, zz], view, xs, ys) {
 
 /** What moves with the slider. @param {number} i instant @param {View} view */
 function stateAt(i, view) {
-  const { xyz, ahead, robot, points, covariances } = run.instants;
+  const { xyz, ahead, robot, points, covariances, in_doubt } = run.instants;
   const [x, y] = [dot(xyz[i], view.across), dot(xyz[i], view.up)];
   const px = along(points[i], view.across), py = along(points[i], view.up);
   /** @type {Curve} */ const ex = [];
@@ -96,10 +96,12 @@ function stateAt(i, view) {
     hx.push(x, dot(end, view.across), null);
     hy.push(y, dot(end, view.up), null);
   });
+  /** @param {Curve} all */
+  const doubted = (all) => in_doubt[i].map((/** @type {number} */ n) => all[n]);
   return {
-    x: [px, ex, rx, [x, x + length * dot(ahead[i], view.across)], hx, [x]],
-    y: [py, ey, ry, [y, y + length * dot(ahead[i], view.up)], hy, [y]],
-    text: [run.instants.ids[i].map((/** @type {number} */ id) => String(id)), null, null, null, null, null],
+    x: [px, ex, rx, [x, x + length * dot(ahead[i], view.across)], hx, doubted(px), [x]],
+    y: [py, ey, ry, [y, y + length * dot(ahead[i], view.up)], hy, doubted(py), [y]],
+    text: [run.instants.ids[i].map((/** @type {number} */ id) => String(id)), null, null, null, null, null, null],
   };
 }
 
@@ -108,6 +110,7 @@ const extent = (() => {
   return Math.max(...all.map((v) => (v.length ? v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.max(a, b)) - v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.min(a, b)) : 1)), 0.1);
 })();
 
+const hasDoubts = run.instants.in_doubt.some((/** @type {any[]} */ each) => each.length > 0);
 const hasHalves = [...run.instants.rings, ...run.instants.rays].some((/** @type {any[]} */ each) => each.length > 0);
 
 /** @param {boolean} isPlan @param {View} view */
@@ -139,7 +142,8 @@ function mapFigure(isPlan, view) {
     { x: first.x[2], y: first.y[2], mode: 'lines', name: '95 %, robot', line: { color: RED, width: 2 }, hoverinfo: 'skip' },
     { x: first.x[3], y: first.y[3], mode: 'lines', showlegend: false, line: { color: RED, width: 3 }, hoverinfo: 'skip' },
     { x: first.x[4], y: first.y[4], mode: 'lines', name: 'distances, directions', showlegend: hasHalves, line: { color: SKY, width: 1 }, hoverinfo: 'skip' },
-    { x: first.x[5], y: first.y[5], mode: 'markers', name: 'robot', marker: { size: 10, color: RED, line: { color: '#fff', width: 1 } }, hoverinfo: 'skip' },
+    { x: first.x[5], y: first.y[5], mode: 'markers', name: 'elsewhere in another map that fits', showlegend: hasDoubts, marker: { symbol: 'diamond-open', size: 14, color: PINK, line: { width: 2 } }, hoverinfo: 'skip' },
+    { x: first.x[6], y: first.y[6], mode: 'markers', name: 'robot', marker: { size: 10, color: RED, line: { color: '#fff', width: 1 } }, hoverinfo: 'skip' },
   );
   const axis = { gridcolor: grid(), zeroline: false, automargin: true };
   /** @type {any} */
@@ -352,7 +356,7 @@ function update() {
     const place = element(String(id));
     if (!place.dataset.still) return;
     const still = Number(place.dataset.still), state = stateAt(i, /** @type {View} */ (view));
-    Plotly.restyle(place, { x: state.x, y: state.y, text: state.text.map((text) => text || '') }, [0, 1, 2, 3, 4, 5].map((n) => still + n));
+    Plotly.restyle(place, { x: state.x, y: state.y, text: state.text.map((text) => text || '') }, [0, 1, 2, 3, 4, 5, 6].map((n) => still + n));
   });
   if (printing) return;
   Plotly.relayout('curves', { 'shapes[0].x0': t, 'shapes[0].x1': t });
