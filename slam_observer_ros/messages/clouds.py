@@ -142,7 +142,13 @@ def decode_point_cloud2(reader: CdrReader) -> ObservationEvent:
     if height * width == 0:
         no_ids = np.zeros(0, dtype=np.int64)
         return ObservationEvent(stamp_ns, no_ids, np.zeros((0, 3)), sensor_frame=frame_id)
-    _check_size(len(data), height, width, point_step, row_step)
+    if height > 1 and row_step < width * point_step:  # rows overlap
+        raise MessageError(f'row_step {row_step} is shorter than {width} points')
+    needed = (height - 1) * row_step + width * point_step
+    if len(data) < needed:
+        raise MessageError(
+            f'data too short: {height} x {width} points need {needed} bytes, not {len(data)}'
+        )
     dtype = _record_type(fields, byte_order, point_step)
     strides = (row_step if height > 1 else len(data), point_step)
     records: Records = np.ndarray((height, width), dtype, data, strides=strides)
@@ -232,48 +238,35 @@ def _require_whole_groups(names: set[str]) -> None:
             raise MessageError(f'missing field {" ".join(missing)}')
 
 
-def _check_size(size: int, height: int, width: int, point_step: int, row_step: int) -> None:
-    """Refuse rows that overlap, and more points than there are in ``size`` bytes."""
-    if height > 1 and row_step < width * point_step:
-        raise MessageError(f'row_step {row_step} is shorter than {width} points')
-    needed = (height - 1) * row_step + width * point_step
-    if size < needed:
-        raise MessageError(
-            f'data too short: {height} x {width} points need {needed} bytes, not {size}'
-        )
-
-
 def _observation(stamp_ns: int, frame_id: str, records: Records) -> ObservationEvent:
-    if POINT_NAMES[0] not in _names(records):
-        return _ranges(stamp_ns, frame_id, records)
+    names = records.dtype.names or ()
+    if POINT_NAMES[0] not in names:
+        ranges, ids = _columns(records, (RANGE_NAME,))[:, 0], _ids(records)
+        variances = None
+        if RANGE_VARIANCE_NAME in names:
+            variances = _columns(records, (RANGE_VARIANCE_NAME,))[:, 0]
+        return observed_ranges(frame_id, stamp_ns, ids, ranges, variances)
     points = _columns(records, POINT_NAMES)
     measured = is_measured(points)
     if not measured.all():  # The other fields of such points may hold anything.
         records, points = records[measured.reshape(records.shape)], points[measured]
     covariances = velocities = None
-    if COVARIANCE_NAMES[0] in _names(records):
+    if COVARIANCE_NAMES[0] in names:
         upper_triangles = _columns(records, COVARIANCE_NAMES)
         if upper_triangles.any():  # All zeros is how ROS messages say 'unknown'.
             covariances = upper_triangles[:, _UPPER_TRIANGLE_TO_MATRIX].reshape(-1, 3, 3)
-    if VELOCITY_NAMES[0] in _names(records):
+    if VELOCITY_NAMES[0] in names:
         velocities = _columns(records, VELOCITY_NAMES)
     event = ObservationEvent(
         stamp_ns, _ids(records), points, covariances, velocities, sensor_frame=frame_id
     )
-    if NO_RANGE_NAME not in _names(records):
+    if NO_RANGE_NAME not in names:
         return event
     are_directions = records[NO_RANGE_NAME].ravel() != 0
     lengths = np.linalg.norm(points, axis=1)
     points[are_directions] /= np.maximum(lengths, np.finfo(np.float64).tiny)[are_directions, None]
     kinds = np.where(are_directions, BEARING, POINT)
     return replace(event, kinds=kinds).select(~are_directions | (lengths > 0.0))
-
-
-def _ranges(stamp_ns: int, frame_id: str, records: Records) -> ObservationEvent:
-    names = [name for name in (RANGE_NAME, RANGE_VARIANCE_NAME) if name in _names(records)]
-    columns = _columns(records, tuple(names))
-    variances = columns[:, 1] if len(names) > 1 else None
-    return observed_ranges(frame_id, stamp_ns, _ids(records), columns[:, 0], variances)
 
 
 def observed_ranges(
@@ -292,19 +285,11 @@ def observed_ranges(
     if variances is not None and variances.any():
         covariances = np.zeros((len(ids), 3, 3))
         covariances[:, 0, 0] = variances
+    kinds = np.full(len(ids), RANGE)
     event = ObservationEvent(
-        stamp_ns,
-        ids,
-        points,
-        covariances,
-        sensor_frame=frame_id,
-        kinds=np.full(len(ids), RANGE),
+        stamp_ns, ids, points, covariances, sensor_frame=frame_id, kinds=kinds
     )
     return event.select(is_measured(points) & (points[:, 0] > 0.0))
-
-
-def _names(records: Records) -> tuple[str, ...]:
-    return records.dtype.names or ()
 
 
 def _columns(records: Records, names: tuple[str, ...]) -> FloatArray:
@@ -318,7 +303,7 @@ def _columns(records: Records, names: tuple[str, ...]) -> FloatArray:
 
 
 def _ids(records: Records) -> IntArray:
-    if ID_NAME not in _names(records):
+    if ID_NAME not in (records.dtype.names or ()):
         return np.full(records.size, UNKNOWN_ID, dtype=np.int64)
     values = records[ID_NAME].ravel()
     if values.dtype.kind == 'f':

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
 import re
 
 import numpy as np
@@ -18,7 +17,12 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import BEARING, MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.clouds import is_measured, skip_cloud
-from slam_observer_ros.messages.fiducials import NESTED, observed_poses, orientations_of
+from slam_observer_ros.messages.fiducials import (
+    as_arrays,
+    NESTED,
+    observed_poses,
+    orientations_of,
+)
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.messages.registry import Decoder, reads
 
@@ -33,7 +37,7 @@ IN_IMAGES = (APRILTAGS, BOXES)
 _POSE = 7
 _COVARIANCE = 36
 _SIZE = 3
-_CORNERS = 10
+_CENTRE_AND_CORNERS = 10
 _HOMOGRAPHY = 9
 _BOX = 5  # centre, rotation and size
 MAX_NAMES = 12  # names of frames that a log line lists
@@ -58,15 +62,23 @@ _HASH_LENGTH = 64  # no more of a name is searched: that takes the square of the
 def decode_apriltags(reader: CdrReader) -> ObservationEvent:
     """Read an apriltag_msgs/AprilTagDetectionArray: which fiducials are seen; /tf has where."""
     stamp_ns, frame_id = reader.header()
-    tags = [_read_apriltag(reader) for _ in range(reader.uint32())]
-    ids = np.array([number for number, _, _ in tags], dtype=np.int64)
+    families, tags = [], []
+    for _ in range(reader.uint32()):
+        families.append(reader.string())
+        number = reader.int32()
+        reader.int32()  # hamming distance
+        reader.float32(2)  # goodness, decision margin
+        tags.append((number, reader.float64(_CENTRE_AND_CORNERS + _HOMOGRAPHY)[:2]))
+        if number < 0:
+            raise MessageError(f'negative tag id {number}')
+    ids, pixels = as_arrays(tags, 2)
     return ObservationEvent(
         stamp_ns,
         ids,
-        np.full((len(tags), 3), np.nan),
+        np.full((len(ids), 3), np.nan),
         sensor_frame=frame_id,
-        families=tuple(name for _, name, _ in tags),
-        pixels=np.array([centre for _, _, centre in tags]).reshape(-1, 2),
+        families=tuple(families),
+        pixels=pixels,
     )
 
 
@@ -110,10 +122,7 @@ def _read_detections(
     """Read detections with these fields behind their box."""
     stamp_ns, frame_id = reader.header()
     detections = [_read_detection(reader, rest, has_numbers) for _ in range(reader.uint32())]
-    ids = np.array([landmark_id for landmark_id, _, _ in detections], dtype=np.int64)
-    poses = np.array([pose for _, pose, _ in detections]).reshape(-1, _POSE)
-    covariances = np.array([covariance for _, _, covariance in detections]).reshape(-1, 6, 6)
-    return observed_poses(frame_id, stamp_ns, ids, poses, covariances)
+    return observed_poses(frame_id, stamp_ns, *as_arrays(detections, _POSE + _COVARIANCE))
 
 
 # Releases of vision_msgs until ROS 2 Foxy, by what is behind the box of a detection.
@@ -142,12 +151,20 @@ def observed_tags(
         for message in transforms
         if (match := pattern.fullmatch(message.child_frame_id)) and not message.problem
     ]
-    seen = [sighting for sighting in seen if sighting[1] != UNKNOWN_ID]
-    seen.sort(key=_camera_and_stamp)
-    return [
-        _observation(frame_id, stamp_ns, list(group))
-        for (frame_id, stamp_ns), group in groupby(seen, key=_camera_and_stamp)
-    ]
+    by_camera: dict[tuple[str, int], list[tuple[int, FloatArray]]] = {}
+    for message, number in seen:
+        if number != UNKNOWN_ID:
+            values = np.concatenate([message.position, message.quaternion])
+            camera = message.frame_id, message.stamp_ns
+            by_camera.setdefault(camera, []).append((number, values))
+    events = []
+    for (frame_id, stamp_ns), sightings in sorted(by_camera.items(), key=lambda item: item[0]):
+        ids, poses = as_arrays(sightings, _POSE)
+        R = orientations_of(poses[:, 3:])
+        events.append(
+            ObservationEvent(stamp_ns, ids, poses[:, :3], orientations=R, sensor_frame=frame_id)
+        )
+    return events
 
 
 def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
@@ -168,31 +185,10 @@ def _landmark_id(digits: str) -> int:
     return int(significant) if int(significant) <= MAX_ID else UNKNOWN_ID
 
 
-def _id_in_name(name: str) -> int:
-    """Return the number that ends the name of a detection; the unknown id if none does."""
-    match = _TRAILING_NUMBER.fullmatch(name)
-    if match is None or _HASH.search(name[-_HASH_LENGTH:]):
-        return UNKNOWN_ID
-    return _landmark_id(match[1])
-
-
-def _camera_and_stamp(sighting: tuple[PoseMessage, int]) -> tuple[str, int]:
-    return sighting[0].frame_id, sighting[0].stamp_ns
-
-
-def _observation(
-    frame_id: str, stamp_ns: int, sightings: Sequence[tuple[PoseMessage, int]]
-) -> ObservationEvent:
-    ids = np.array([landmark_id for _, landmark_id in sightings], dtype=np.int64)
-    points = np.array([message.position for message, _ in sightings])
-    R = orientations_of(np.array([message.quaternion for message, _ in sightings]))
-    return ObservationEvent(stamp_ns, ids, points, orientations=R, sensor_frame=frame_id)
-
-
 def _read_detection(
     reader: CdrReader, rest: Sequence[str], has_numbers: bool
-) -> tuple[int, FloatArray, FloatArray]:
-    """Read a vision_msgs/Detection3D: id, position and quaternion (7,), covariance (6, 6)."""
+) -> tuple[int, FloatArray]:
+    """Read a vision_msgs/Detection3D: id; position, quaternion and covariance (43,)."""
     reader.header()
     results = [_read_result(reader, has_numbers) for _ in range(reader.uint32())]
     centre, name = reader.float64(_POSE + _SIZE)[:_POSE], ''
@@ -203,41 +199,29 @@ def _read_detection(
             reader.uint8()
         else:
             name = reader.string()
-    landmark_id = _id_of(name, results)
     if results and results[0][1][:3].any():
-        _, pose, covariance = results[0]
-        return landmark_id, pose, covariance
+        return _id_of(name, results), results[0][1]
     # Detectors that fill in the box only leave the position of the result at zero.
-    return landmark_id, centre, np.zeros((6, 6))
+    return _id_of(name, results), np.concatenate([centre, np.zeros(_COVARIANCE)])
 
 
-def _id_of(name: str, results: Sequence[tuple[str, FloatArray, FloatArray]]) -> int:
+def _id_of(name: str, results: Sequence[tuple[str, FloatArray]]) -> int:
     """Return the number that ends the id of a detection, or else its first result's class."""
-    names = [name, *(class_id for class_id, _, _ in results[:1])]
-    ids = (_id_in_name(name) for name in names)
-    return next((number for number in ids if number != UNKNOWN_ID), UNKNOWN_ID)
+    for text in (name, *(class_id for class_id, _ in results[:1])):
+        match = _TRAILING_NUMBER.fullmatch(text)
+        number = UNKNOWN_ID if match is None else _landmark_id(match[1])
+        if number != UNKNOWN_ID and not _HASH.search(text[-_HASH_LENGTH:]):
+            return number
+    return UNKNOWN_ID
 
 
-def _read_result(reader: CdrReader, has_numbers: bool) -> tuple[str, FloatArray, FloatArray]:
-    """Read a vision_msgs/ObjectHypothesisWithPose: class, pose (7,), covariance (6, 6)."""
+def _read_result(reader: CdrReader, has_numbers: bool) -> tuple[str, FloatArray]:
+    """Read a vision_msgs/ObjectHypothesisWithPose: class; pose and covariance (43,)."""
     name = str(reader.int64(1)[0]) if has_numbers else reader.string()
-    values = reader.float64(1 + _POSE + _COVARIANCE)  # the score comes first
-    covariance = values[1 + _POSE :].reshape(6, 6)
-    if covariance[0, 0] < 0.0:  # unknown
-        covariance = np.zeros((6, 6))
-    return name, values[1 : 1 + _POSE], covariance
-
-
-def _read_apriltag(reader: CdrReader) -> tuple[int, str, FloatArray]:
-    """Read an apriltag_msgs/AprilTagDetection: id, family and centre (2,), pixels."""
-    family = reader.string()
-    landmark_id = reader.int32()
-    reader.int32()  # hamming distance
-    reader.float32(2)  # goodness, decision margin
-    centre = reader.float64(_CORNERS + _HOMOGRAPHY)[:2]
-    if landmark_id < 0:
-        raise MessageError(f'negative tag id {landmark_id}')
-    return landmark_id, family, centre
+    values = reader.float64(1 + _POSE + _COVARIANCE)[1:]  # the score comes first
+    if values[_POSE] < 0.0:  # unknown
+        values[_POSE:] = 0.0
+    return name, values
 
 
 @reads(
@@ -261,9 +245,13 @@ def decode_boxes(reader: CdrReader) -> ObservationEvent:
     Ids are as in a Detection3DArray.
     """
     stamp_ns, frame_id = reader.header()
-    boxes = [_read_box(reader) for _ in range(reader.uint32())]
-    ids = np.array([landmark_id for landmark_id, _ in boxes], dtype=np.int64)
-    pixels = np.array([centre for _, centre in boxes]).reshape(-1, 2)
+    boxes = []
+    for _ in range(reader.uint32()):
+        reader.header()
+        results = [_read_result(reader, False) for _ in range(reader.uint32())]
+        centre = reader.float64(_BOX)[:2]
+        boxes.append((_id_of(reader.string(), results), centre))
+    ids, pixels = as_arrays(boxes, 2)
     event = ObservationEvent(
         stamp_ns,
         ids,
@@ -273,14 +261,6 @@ def decode_boxes(reader: CdrReader) -> ObservationEvent:
         pixels=pixels,
     )
     return event.select(is_measured(pixels))
-
-
-def _read_box(reader: CdrReader) -> tuple[int, FloatArray]:
-    """Read a vision_msgs/Detection2D: id and centre (2,), pixels."""
-    reader.header()
-    results = [_read_result(reader, False) for _ in range(reader.uint32())]
-    centre = reader.float64(_BOX)[:2]
-    return _id_of(reader.string(), results), centre
 
 
 @dataclass(frozen=True, slots=True, eq=False)

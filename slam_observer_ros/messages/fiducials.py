@@ -5,6 +5,7 @@ Messages are read from their bytes, so that none of the packages that define the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
 import re
@@ -39,17 +40,15 @@ NESTED = f'{"=" * 80}\nMSG: '  # what comes before the name of a nested type in 
 def decode_isaac_apriltags(reader: CdrReader) -> ObservationEvent:
     """Read an AprilTagDetectionArray of isaac_ros_apriltag_interfaces, which has the poses."""
     stamp_ns, frame_id = reader.header()
-    numbers, poses = [], []
+    tags = []
     for _ in range(reader.uint32()):
         reader.string()  # family
-        numbers.append(reader.int32())
+        number = reader.int32()
         reader.float64(_CENTRE_AND_CORNERS)
         reader.header()
-        poses.append(reader.float64(_POSE + _COVARIANCE))
-    ids = np.array(numbers, dtype=np.int64)
-    values = np.array(poses).reshape(-1, _POSE + _COVARIANCE)
-    covariances = values[:, _POSE:].reshape(-1, 6, 6)
-    return observed_poses(frame_id, stamp_ns, _usable(ids), values[:, :_POSE], covariances)
+        tags.append((number, reader.float64(_POSE + _COVARIANCE)))
+    ids, values = as_arrays(tags, _POSE + _COVARIANCE)
+    return observed_poses(frame_id, stamp_ns, _usable(ids), values)
 
 
 @reads(
@@ -69,9 +68,7 @@ def decode_aruco_detection(reader: CdrReader) -> ObservationEvent:
     for _ in range(reader.uint32()):
         reader.string()
         reader.float64(_POSE)
-    ids = np.array([marker_id for marker_id, _ in markers], dtype=np.int64)
-    poses = np.array([pose for _, pose in markers]).reshape(-1, _POSE)
-    return observed_poses(frame_id, stamp_ns, ids, poses)
+    return observed_poses(frame_id, stamp_ns, *as_arrays(markers, _POSE))
 
 
 @reads(
@@ -91,20 +88,25 @@ def decode_aruco_markers(reader: CdrReader) -> ObservationEvent:
     return observed_poses(frame_id, stamp_ns, _usable(ids), poses)
 
 
-def observed_poses(
-    frame_id: str,
-    stamp_ns: int,
-    ids: IntArray,
-    poses: FloatArray,
-    pose_covariances: FloatArray | None = None,
-) -> ObservationEvent:
-    """Return landmarks at ``poses`` (m, 7), position first, seen in one frame.
+def as_arrays(
+    entries: Sequence[tuple[int, FloatArray]], width: int
+) -> tuple[IntArray, FloatArray]:
+    """Return ids (m,) and values (m, width) of entries that each have an id and its values."""
+    ids = np.array([number for number, _ in entries], dtype=np.int64)
+    return ids, np.array([values for _, values in entries]).reshape(-1, width)
 
-    Of ``pose_covariances`` (m, 6, 6), zero where unknown, the positions' are used if they
-    are known of all.
+
+def observed_poses(
+    frame_id: str, stamp_ns: int, ids: IntArray, values: FloatArray
+) -> ObservationEvent:
+    """Return landmarks seen in one frame, at poses (m, 7), position first, or with more (m, 43).
+
+    Covariances (6, 6) come behind the poses then, zero where unknown: the positions' are used if
+    they are known of all.
     """
-    covariances = turns = None
-    if pose_covariances is not None:
+    poses, covariances, turns = values[:, :_POSE], None, None
+    if values.shape[1] > _POSE:
+        pose_covariances = values[:, _POSE:].reshape(-1, 6, 6)
         of_positions, of_turns = pose_covariances[:, :3, :3], pose_covariances[:, 3:, 3:]
         is_known = len(ids) > 0 and bool(of_positions.any(axis=(1, 2)).all())
         covariances = of_positions if is_known else None
@@ -166,9 +168,10 @@ class LandmarkNames:
             return UNKNOWN_ID
         if name in self._numbers:
             return self._numbers[name]
-        number = _as_number(name)
-        if number is None:
-            number = FIRST_NAMED_ID + _hash_of(name)
+        number = FIRST_NAMED_ID + _hash_of(name)
+        if name.isascii() and name.isdigit() and len(name) <= len(str(MAX_ID)):
+            # With zeros before the number it is a name.
+            number = int(name) if str(int(name)) == name and int(name) <= MAX_ID else number
         if number < FIRST_NAMED_ID:
             return number
         if number in self._names:
@@ -207,15 +210,15 @@ def decode_landmark_list(reader: CdrReader) -> ObservationEvent:
     """
     stamp_ns, frame_id = reader.header()
     entries = [(reader.string(), reader.float64(_POSE + 2)) for _ in range(reader.uint32())]
-    ids = np.array([NAMES.number_of(name) for name, _ in entries], dtype=np.int64)
-    values = np.array([value for _, value in entries]).reshape(-1, _POSE + 2)
-    poses, weights = values[:, :_POSE], values[:, _POSE:]
-    variances = _variances(weights)
-    covariances = np.zeros((len(ids), 6, 6))
-    for axis in range(6):
-        covariances[:, axis, axis] = variances[:, axis // 3]
+    ids, values = as_arrays([(NAMES.number_of(name), each) for name, each in entries], _POSE + 2)
+    with np.errstate(divide='ignore', over='ignore', invalid='ignore'):
+        variances = values[:, _POSE:] ** -2.0
+    variances[~np.isfinite(variances)] = 0.0
+    poses = values[:, :_POSE]
     poses[variances[:, 1] == 0.0, 3:] = 0.0
-    return observed_poses(frame_id, stamp_ns, ids, poses, covariances)
+    covariances = np.repeat(variances, 3, axis=1)[:, :, None] * np.eye(6)
+    both = np.concatenate([poses, covariances.reshape(-1, _COVARIANCE)], axis=1)
+    return observed_poses(frame_id, stamp_ns, ids, both)
 
 
 @reads(
@@ -241,8 +244,7 @@ def decode_range_bearing(reader: CdrReader) -> ObservationEvent:
     reader.float64(_POSE + 2)  # the sensor's pose, and its least and largest range
     deviations = reader.float64(3)
     sensed = [(reader.float64(3), reader.int32()) for _ in range(reader.uint32())]
-    numbers = np.array([number for _, number in sensed], dtype=np.int64)
-    measured = np.array([value for value, _ in sensed]).reshape(-1, 3)
+    numbers, measured = as_arrays([(number, value) for value, number in sensed], 3)
     usable = is_measured(measured) & (measured[:, 0] > 0.0)
     ids: IntArray = np.where(numbers >= 0, numbers, UNKNOWN_ID)[usable]
     points, axes = _along_and_across(measured[usable])
@@ -250,25 +252,9 @@ def decode_range_bearing(reader: CdrReader) -> ObservationEvent:
     return ObservationEvent(stamp_ns, ids, points, covariances, sensor_frame=frame_id)
 
 
-def _as_number(name: str) -> int | None:
-    """Return the id that a text is; None if it is a name, as with zeros before the number."""
-    if not (name.isascii() and name.isdigit()) or len(name) > len(str(MAX_ID)):
-        return None
-    number = int(name)
-    return number if str(number) == name and number <= MAX_ID else None
-
-
 def _hash_of(name: str) -> int:
     digest = int.from_bytes(sha256(name.encode()).digest()[:8], 'big')
     return digest % (MAX_ID + 1 - FIRST_NAMED_ID)
-
-
-def _variances(weights: FloatArray) -> FloatArray:
-    """Return 1/weight² (m, 2), zero where the weight says nothing."""
-    with np.errstate(divide='ignore', over='ignore', invalid='ignore'):
-        variances = weights**-2.0
-    result: FloatArray = np.where(np.isfinite(variances), variances, 0.0)
-    return result
 
 
 def _along_and_across(measured: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -316,12 +302,11 @@ def decode_range_beacon(reader: CdrReader) -> ObservationEvent:
     """Read an mrpt_msgs/ObservationRangeBeacon, placed as an ObservationRangeBearing is."""
     stamp_ns, frame_id = reader.header()
     deviation_m = float(reader.float64(_POSE + 3)[-1])
-    sensed = [(reader.float64(1)[0], reader.int32()) for _ in range(reader.uint32())]
-    ids = np.array([number for _, number in sensed], dtype=np.int64)
-    ranges = np.array([value for value, _ in sensed])
+    sensed = [(reader.float64(1), reader.int32()) for _ in range(reader.uint32())]
+    ids, ranges = as_arrays([(number, value) for value, number in sensed], 1)
     variance = deviation_m * deviation_m if deviation_m > 0.0 else 0.0
     variances = np.full(len(ids), variance if np.isfinite(variance) else 0.0)
-    return observed_ranges(frame_id, stamp_ns, _usable(ids), ranges, variances)
+    return observed_ranges(frame_id, stamp_ns, _usable(ids), ranges[:, 0], variances)
 
 
 def _register_linktrack(frame: str, own: str, own_numbers: int, node: str, angle: str) -> None:

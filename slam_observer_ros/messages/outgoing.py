@@ -46,15 +46,9 @@ _PACK_STAMP = struct.Struct('<BBBBiI')
 class OutgoingMessages:
     """Makes messages of rclpy's classes or of rosbags', which have the same fields.
 
-    Every float field gets a Python float: rclpy does not check that.
-
-    Parameters
-    ----------
-    class_of : callable
-        Returns the class of a type such as ``geometry_msgs/msg/Pose``.
-    octets : callable
-        Returns bytes as these classes want them in a field ``uint8[]``.
-
+    Every float field gets a Python float: rclpy does not check that. ``class_of`` returns the
+    class of a type such as ``geometry_msgs/msg/Pose``, ``octets`` bytes as these classes want them
+    in a field ``uint8[]``.
     """
 
     def __init__(
@@ -142,7 +136,11 @@ class OutgoingMessages:
             columns = _of_ranges(ids, points, covariances)
         else:
             columns = _of_points(ids, points, covariances, velocities, kinds)
-        records = _cloud_records(columns)
+        # One record a point, little endian, every field of four bytes
+        dtype = [(name, '<u4' if name in _INTEGERS else '<f4') for name in columns]
+        records: NDArray[np.void] = np.empty(len(ids), dtype=dtype)
+        for name, column in columns.items():
+            records[name] = column
         fields = [
             self.make(
                 'sensor_msgs/msg/PointField',
@@ -151,7 +149,7 @@ class OutgoingMessages:
                 datatype=POINT_FIELD_UINT32 if name in _INTEGERS else POINT_FIELD_FLOAT32,
                 count=1,
             )
-            for index, name in enumerate(records.dtype.names or ())
+            for index, name in enumerate(columns)
         ]
         return self.make(
             'sensor_msgs/msg/PointCloud2',
@@ -238,15 +236,6 @@ def _of_ranges(ids: IntArray, points: FloatArray, covariances: FloatArray | None
     return columns
 
 
-def _cloud_records(columns: _Columns) -> NDArray[np.void]:
-    """Return one record a point, little endian, every field of four bytes."""
-    dtype = [(name, '<u4' if name in _INTEGERS else '<f4') for name in columns]
-    records: NDArray[np.void] = np.empty(len(columns[ID_NAME]), dtype=dtype)
-    for name, column in columns.items():
-        records[name] = column
-    return records
-
-
 PATH_SPACING_NS = 100_000_000  # least time between two poses of the path, nanoseconds
 
 POINT_SIZE_M = 0.2
@@ -296,13 +285,13 @@ def half_sights(
 class EstimateMessages:
     """Makes what says where the robot was and its landmarks are, in ``map_frame``.
 
-    Stamps are nanoseconds, poses (4, 4).
+    Stamps are nanoseconds, poses (4, 4); ids (n,), points (n, 3) in metres and covariances
+    (n, 3, 3) in m², None if unknown. Markers are of the classes that ``messages`` makes.
     """
 
     def __init__(self, messages: OutgoingMessages, map_frame: str) -> None:
         self._messages = messages
         self._map_frame = map_frame
-        self.markers = MarkerMessages(messages, map_frame)
 
     def path_pose(self, stamp_ns: int, pose: FloatArray) -> Any:
         """Make one pose of the path."""
@@ -331,19 +320,7 @@ class EstimateMessages:
         """Make a std_msgs/Float64."""
         return self._messages.make('std_msgs/msg/Float64', data=float(value))
 
-
-class MarkerMessages:
-    """Makes MarkerArrays, of the classes that ``messages`` makes.
-
-    A stamp is in nanoseconds; ids (n,), points (n, 3) in metres and covariances (n, 3, 3) in m²,
-    None if unknown, are in the frame ``frame_id``.
-    """
-
-    def __init__(self, messages: OutgoingMessages, frame_id: str) -> None:
-        self._messages = messages
-        self._frame_id = frame_id
-
-    def landmarks(
+    def markers(
         self,
         stamp_ns: int,
         ids: IntArray,
@@ -352,33 +329,47 @@ class MarkerMessages:
         update: Update | None,
         doubted_ids: IntArray,
     ) -> Any:
-        """Return markers that replace all earlier ones.
+        """Make a MarkerArray that replaces all earlier markers.
 
         They are points, those in doubt in another colour, ids, the last residuals, distances and
         directions, and, where covariances are known, ellipsoids.
         """
+        header = self._messages.header(stamp_ns, self._map_frame)
         if not len(points):
-            return self.none(stamp_ns)
-        header = self._messages.header(stamp_ns, self._frame_id)
-        labels = [
-            self._label(header, number, landmark_id, point)
-            for number, (landmark_id, point) in enumerate(
-                zip(ids[:MAX_LABELS].tolist(), points, strict=False)
-            )
-        ]
-        lines = self._residual_lines(header, ids, points, update)
+            return self._replacing(header, [])
+        spheres, in_doubt = [], np.isin(ids, doubted_ids)
+        for namespace, color, rows in (
+            ('landmarks', GREEN, ~in_doubt),
+            ('in doubt', PINK, in_doubt),
+        ):
+            if namespace == 'landmarks' or rows.any():
+                marker = self._marker(header, namespace, SPHERE_LIST, color, POINT_SIZE_M)
+                marker.points = [self._messages.point(point) for point in points[rows]]
+                spheres.append(marker)
+        # From each landmark just seen to where it was seen
+        lines = self._marker(header, 'residuals', LINE_LIST, ORANGE, LINE_WIDTH_M)
+        halves: list[Any] = []
+        if update is not None:
+            _, seen, at = np.intersect1d(update.ids, ids, return_indices=True)
+            ends = np.stack((points[at], points[at] + update.residuals[seen]), axis=1)
+            lines.points = [self._messages.point(point) for point in ends.reshape(-1, 3)]
+            halves = self._halves(header, ids, points, update)
         ellipsoids = self._ellipsoids(header, points, covariances)
-        halves = [] if update is None else self._halves(header, ids, points, update)
-        in_doubt = np.isin(ids, doubted_ids)
-        spheres = [self._points(header, 'landmarks', GREEN, points[~in_doubt])]
-        if in_doubt.any():
-            spheres.append(self._points(header, 'in doubt', PINK, points[in_doubt]))
-        drawn = [*spheres, lines, *halves, *ellipsoids, *labels]
-        return self._array([self._removal(header), *drawn])
+        labels = []
+        for number, landmark_id in enumerate(ids[:MAX_LABELS].tolist()):
+            label = self._marker(header, 'ids', TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)
+            label.id, label.text = number, str(landmark_id)
+            label.pose.position = self._messages.point(points[number] + [0.0, 0.0, TEXT_HEIGHT_M])
+            labels.append(label)
+        return self._replacing(header, [*spheres, lines, *halves, *ellipsoids, *labels])
+
+    def no_markers(self, stamp_ns: int) -> Any:
+        """Make what removes all earlier markers."""
+        return self._replacing(self._messages.header(stamp_ns, self._map_frame), [])
 
     def places(self, stamp_ns: int, poses: FloatArray) -> Any:
-        """Return arrows, in place of all earlier markers, at poses (q, 4, 4) of a lost robot."""
-        header = self._messages.header(stamp_ns, self._frame_id)
+        """Make arrows, in place of all earlier markers, at poses (q, 4, 4) of a lost robot."""
+        header = self._messages.header(stamp_ns, self._map_frame)
         arrows = []
         for number, pose in enumerate(poses[:MAX_LABELS]):
             arrow = self._marker(header, 'possible places', ARROW, ORANGE, ARROW_WIDTH_M)
@@ -386,24 +377,12 @@ class MarkerMessages:
             arrow.pose = self._messages.pose(pose)
             arrow.scale.x = ARROW_LENGTH_M
             arrows.append(arrow)
-        return self._array([self._removal(header), *arrows])
+        return self._replacing(header, arrows)
 
-    def none(self, stamp_ns: int) -> Any:
-        """Return what removes all earlier markers."""
-        return self._array([self._removal(self._messages.header(stamp_ns, self._frame_id))])
-
-    def _array(self, markers: list[Any]) -> Any:
-        return self._messages.make('visualization_msgs/msg/MarkerArray', markers=markers)
-
-    def _removal(self, header: Any) -> Any:
-        return self._marker(header, '', 0, WHITE, 0.0, action=DELETEALL)
-
-    def _points(
-        self, header: Any, namespace: str, color: tuple[float, ...], points: FloatArray
-    ) -> Any:
-        marker = self._marker(header, namespace, SPHERE_LIST, color, POINT_SIZE_M)
-        marker.points = [self._messages.point(point) for point in points]
-        return marker
+    def _replacing(self, header: Any, markers: list[Any]) -> Any:
+        removal = self._marker(header, '', 0, WHITE, 0.0, action=DELETEALL)
+        array = 'visualization_msgs/msg/MarkerArray'
+        return self._messages.make(array, markers=[removal, *markers])
 
     def _ellipsoids(
         self, header: Any, points: FloatArray, covariances: FloatArray | None
@@ -423,18 +402,6 @@ class MarkerMessages:
             marker.scale = self._messages.vector(np.maximum(size, MIN_SIZE_M))
             markers.append(marker)
         return markers
-
-    def _residual_lines(
-        self, header: Any, ids: IntArray, points: FloatArray, update: Update | None
-    ) -> Any:
-        """Return a line from each landmark just seen to where it was seen."""
-        marker = self._marker(header, 'residuals', LINE_LIST, ORANGE, LINE_WIDTH_M)
-        if update is not None:
-            _, seen, rows = np.intersect1d(update.ids, ids, return_indices=True)
-            ends = points[rows]
-            lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
-            marker.points = [self._messages.point(point) for point in lines]
-        return marker
 
     def _halves(self, header: Any, ids: IntArray, points: FloatArray, update: Update) -> list[Any]:
         """Return circles of distances about their landmarks, and lines in directions, if any."""
@@ -457,13 +424,6 @@ class MarkerMessages:
             if marker.points:
                 markers.append(marker)
         return markers
-
-    def _label(self, header: Any, number: int, landmark_id: int, point: FloatArray) -> Any:
-        marker = self._marker(header, 'ids', TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)
-        marker.id = number
-        marker.text = str(landmark_id)
-        marker.pose.position = self._messages.point(point + [0.0, 0.0, TEXT_HEIGHT_M])
-        return marker
 
     def _marker(
         self,
@@ -552,7 +512,8 @@ def uncertain_pose(pose: FloatArray, covariance: FloatArray | None) -> FloatArra
 
 def encode_transform(stamp_ns: int, parent: str, child: str, pose: FloatArray) -> bytes:
     """Serialise a tf2_msgs/TFMessage of the pose of frame ``child`` in frame ``parent``."""
-    return _transform_layout(parent, child).message(stamp_ns, *_position_and_quaternion(pose))
+    layout = _kept_layout((parent, child), POSE_NUMBERS, of_sequence=True)
+    return layout.message(stamp_ns, *_position_and_quaternion(pose))
 
 
 def _covariance(covariance: FloatArray | None) -> FloatArray:
@@ -566,11 +527,6 @@ def _covariance(covariance: FloatArray | None) -> FloatArray:
 def _position_and_quaternion(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return position (3,) and quaternion (4,) xyzw."""
     return pose[:3, 3], so3.to_quaternion(pose[:3, :3])
-
-
-@lru_cache(maxsize=8)
-def _transform_layout(parent: str, child: str) -> _Layout:
-    return _Layout((parent, child), POSE_NUMBERS, of_sequence=True)
 
 
 class _Layout:
@@ -590,3 +546,6 @@ class _Layout:
         _STAMP.pack_into(self._bytes, self._stamp_at, *divmod(stamp_ns, NANOSECONDS_PER_SECOND))
         np.concatenate(numbers, out=self._numbers)
         return bytes(self._bytes)
+
+
+_kept_layout = lru_cache(maxsize=8)(_Layout)

@@ -30,24 +30,14 @@ _NEARLY = 1.0 - 1e-9  # of a limit: what is below that is below the limit, howev
 
 @dataclass(frozen=True, slots=True)
 class PoseMessage:
-    """The pose of ``child_frame_id``, empty if the message doesn't name it, in ``frame_id``.
-
-    Attributes
-    ----------
-    position : FloatArray
-        (3,) metres.
-    quaternion : FloatArray
-        (4,) xyzw; of unit norm, but for transforms that say in ``problem`` that it isn't.
-    covariance : FloatArray or None
-        (6, 6) of rotation vector and position in the axes of ``frame_id``; None if unknown.
-
-    """
+    """The pose of ``child_frame_id``, empty if the message doesn't name it, in ``frame_id``."""
 
     stamp_ns: int
     frame_id: str
     child_frame_id: str
-    position: FloatArray
-    quaternion: FloatArray
+    position: FloatArray  # (3,) metres
+    quaternion: FloatArray  # (4,) xyzw, of unit norm unless ``problem`` says that it isn't
+    # (6, 6) of rotation vector and position in the axes of ``frame_id``; None if unknown
     covariance: FloatArray | None = None
 
     @property
@@ -231,12 +221,6 @@ def decode_odometry_pose(reader: CdrReader) -> PoseMessage:
     return checked_pose(_read_odometry(reader)[0])
 
 
-@Decoder
-def decode_odometry(reader: CdrReader) -> tuple[PoseMessage, VelocityEvent]:
-    """Read pose, which may be none (``problem``), and twist of a nav_msgs/Odometry."""
-    return _read_odometry(reader)
-
-
 @reads('sensor_msgs/msg/Imu', role='angular velocity')
 def decode_imu(reader: CdrReader) -> AngularVelocityEvent:
     """Read the angular velocity of a sensor_msgs/Imu; MessageError if it has none (-1)."""
@@ -252,6 +236,7 @@ def decode_imu(reader: CdrReader) -> AngularVelocityEvent:
 
 
 def _read_odometry(reader: CdrReader) -> tuple[PoseMessage, VelocityEvent]:
+    """Read pose, which may be none (``problem``), and twist of a nav_msgs/Odometry."""
     stamp_ns, frame_id = reader.header()
     child_frame_id = reader.string()
     pose = PoseMessage(
@@ -259,6 +244,9 @@ def _read_odometry(reader: CdrReader) -> tuple[PoseMessage, VelocityEvent]:
     )
     velocity, covariance = _read_twist(reader), read_covariance(reader)
     return pose, VelocityEvent(stamp_ns, velocity, covariance, sensor_frame=child_frame_id)
+
+
+decode_odometry = Decoder(_read_odometry)
 
 
 def _read_twist(reader: CdrReader) -> FloatArray:

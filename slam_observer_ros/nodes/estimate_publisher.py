@@ -195,7 +195,7 @@ class EstimatePublisher:
             return
         if not self._estimator.is_localised and self._markers.get_subscription_count():
             poses = self._estimator.possible_poses
-            self._markers.publish(self._messages.markers.places(stamp_ns, poses))
+            self._markers.publish(self._messages.places(stamp_ns, poses))
         if not self._is_new(self._slow_stamp_ns):
             return
         self._slow_stamp_ns = stamp_ns
@@ -218,7 +218,7 @@ class EstimatePublisher:
             return
         no_ids = np.empty(0, dtype=np.int64)
         self._map.publish(MESSAGES.point_cloud2(stamp_ns, map_frame, no_ids, np.empty((0, 3))))
-        self._markers.publish(self._messages.markers.none(stamp_ns))
+        self._markers.publish(self._messages.no_markers(stamp_ns))
 
     def repeat_transform(self) -> None:
         """Publish the odometry's correction as of now, while no new one comes."""
@@ -265,7 +265,7 @@ class EstimatePublisher:
         self._map.publish(self._messages.landmarks(stamp_ns, *landmarks, velocities))
         if self._markers.get_subscription_count() > 0:
             last, doubted = estimator.last_update, estimator.doubted_ids
-            markers = self._messages.markers.landmarks(stamp_ns, *landmarks, last, doubted)
+            markers = self._messages.markers(stamp_ns, *landmarks, last, doubted)
             self._markers.publish(markers)
 
     def _publish_estimates(self, stamp_ns: int) -> None:

@@ -152,7 +152,7 @@ class EstimateWriter:
         cloud = self._messages.landmarks(stamp_ns, *landmarks, velocities)
         self._write(MAP_TOPIC, cloud, stamp_ns, latched=True)
         last, doubted = estimator.last_update, estimator.doubted_ids
-        markers = self._messages.markers.landmarks(stamp_ns, *landmarks, last, doubted)
+        markers = self._messages.markers(stamp_ns, *landmarks, last, doubted)
         self._write('/markers', markers, stamp_ns)
         status = diagnostics(self._writer.messages, stamp_ns, estimator, self._base_frame)
         self._write(DIAGNOSTICS_TOPIC, status, stamp_ns)

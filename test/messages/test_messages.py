@@ -20,7 +20,7 @@ from slam_observer_ros.messages import clouds, poses
 from slam_observer_ros.messages.outgoing import (
     encode_point_cloud,
     encode_transform,
-    MarkerMessages,
+    EstimateMessages,
     StateMessages,
     uncertain_pose,
 )
@@ -625,7 +625,7 @@ class TestMarkers:
             moved_ids=np.empty(0, np.int64),
             kinds=np.array([BEARING, RANGE, POINT]),
         )
-        drawn = MarkerMessages(ros.OUTGOING, 'map').landmarks(
+        drawn = EstimateMessages(ros.OUTGOING, 'map').markers(
             0, np.array([4, 9, 7]), points, None, update, np.array([7, 8])
         )
         by_namespace = {marker.ns: marker for marker in drawn.markers}
@@ -635,7 +635,7 @@ class TestMarkers:
         assert set(ring[:, 2]) == {0.0}, 'as high as the robot'
         (start, end) = by_namespace['bearings'].points
         assert (start.x, start.y, start.z, end.x, end.y, end.z) == (0, 0, 0, 0, 2.5, 0)
-        whole = MarkerMessages(ros.OUTGOING, 'map').landmarks(
+        whole = EstimateMessages(ros.OUTGOING, 'map').markers(
             0, np.array([4, 9, 7]), points, None, replace(update, kinds=None), np.array([8])
         )
         assert {marker.ns for marker in whole.markers}.isdisjoint({'ranges', 'bearings'})
