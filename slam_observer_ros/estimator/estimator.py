@@ -345,7 +345,7 @@ class Estimator(Estimate):
     def _process_observation(self, event: ObservationEvent) -> None:
         state, warnings = self._state, self._warnings
         if event.kinds is not None and self.settings.two_d_mode:
-            event = self._half_points.levelled(event)
+            event = self._half_points.levelled(event, state.observation_noise)
         usable = usable_points(
             event, self.settings, state.gains, state.landmarks, self._counts, warnings
         )

@@ -36,6 +36,7 @@ from slam_observer_ros.lie.sensor_mounting import (
     unmeasured_covariances,
 )
 from slam_observer_ros.models.calibration import SCALE
+from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.models.point_noise import point_covariances
 from slam_observer_ros.tracking.covariances import turn_to_world
 from slam_observer_ros.tracking.matching import calibrated, residuals_of
@@ -87,7 +88,7 @@ class HalfPoints:
         """Ids of new landmarks whose views fit two places."""
         return sorted(self._waiting.open_sides)
 
-    def levelled(self, event: ObservationEvent) -> ObservationEvent:
+    def levelled(self, event: ObservationEvent, noise: ObservationNoise) -> ObservationEvent:
         """Return ranges in space as they are in the plane, where landmarks' heights are known."""
         if event.kinds is None or not self.heights_m:
             return event
@@ -95,14 +96,25 @@ class HalfPoints:
         sensor_z = event.points[:, 2] - lines[:, 2]
         known = [self.heights_m.get(landmark_id, math.nan) for landmark_id in event.ids.tolist()]
         rise_m, range_m = np.array(known) - sensor_z, np.linalg.norm(lines, axis=1)
-        ranges_alone = (event.kinds == RANGE) & np.isfinite(rise_m) & (range_m > 0.0)
-        level = np.ones(len(lines))
-        share = np.clip(rise_m[ranges_alone] / range_m[ranges_alone], -1.0, 1.0)
-        level[ranges_alone] = np.maximum(np.sqrt(1.0 - share**2), LEAST_LEVEL)
-        covariances = event.covariances
-        if covariances is not None:
-            covariances = covariances / level[:, None, None] ** 2
-        points = event.points + (level - 1.0)[:, None] * lines
+        has_slant = np.isin(event.kinds, (RANGE, AZIMUTH_RANGE)) & (range_m > 0.0)
+        slant = np.flatnonzero(has_slant & np.isfinite(rise_m))
+        if not len(slant):
+            return event
+        share = np.clip(rise_m[slant] / range_m[slant], -1.0, 1.0)
+        level = np.maximum(np.sqrt(1.0 - share**2), LEAST_LEVEL)[:, None]
+        covariances = np.zeros((len(lines), 3, 3))  # where zero, the noise model's
+        if event.covariances is not None:
+            covariances[:] = event.covariances
+        stated = covariances[slant]
+        modelled = ~stated.any(axis=(1, 2))
+        stated[modelled] = noise.at(lines[slant][modelled])
+        # An error along the range is longer on the floor, one across it nearer.
+        along = lines[slant] / range_m[slant, None]
+        longer = (1.0 / level - level) * along
+        M = level[:, :, None] * np.eye(3) + longer[:, :, None] * along[:, None, :]
+        covariances[slant] = M @ stated @ M
+        points = event.points.copy()
+        points[slant] += (level - 1.0) * lines[slant]
         return replace(event, points=points, covariances=covariances)
 
     def completed(

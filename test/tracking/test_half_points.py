@@ -260,14 +260,29 @@ def test_half_points_without_ids_are_left_out_counted_and_named(caplog):
     assert 'Not used: 4 bearings or ranges alone' in caplog.text
 
 
-def test_an_anchor_above_the_plane_is_as_far_as_it_is_on_the_floor():
-    world = World(replace(SETTINGS, two_d_mode=True))
+@pytest.mark.parametrize('kind', [RANGE, AZIMUTH_RANGE])
+def test_an_anchor_above_the_plane_is_as_far_as_it_is_on_the_floor(kind):
+    world = World(SETTINGS)
     world.points[:, 2] = 2.5
     covariances = np.tile(1e-6 * np.eye(3), (N, 1, 1))
     survey = LandmarkMap(np.arange(N), world.points, covariances, np.zeros(N, np.int64))
     world.estimator.load_map(survey, np.eye(4), np.diag([1e-6, 1e-6, 0.01, 0.04, 0.04, 1e-6]))
-    world.drive(60.0, [RANGE], rows=range(N))
+    seen = world.seen
+
+    def seen_level(rows, kinds):
+        for event in seen(rows, kinds):
+            ranges = np.linalg.norm(event.points, axis=1)
+            level = np.linalg.norm(event.points[:, :2], axis=1)
+            flat = event.points / level[:, None] * ranges[:, None] * [1.0, 1.0, 0.0]
+            yield replace(event, points=flat)  # an azimuth says nothing of the height
+
+    world.seen = seen_level
+    world.drive(60.0, [kind], rows=range(N))
     assert np.sqrt(np.mean(np.square(world.errors[20:]))) < 0.1
+    # An error of the distance is longer on the floor, and its noise as much larger.
+    off = np.array(world.errors[20:])
+    sigma_m = np.sqrt(np.trace(world.estimator.pose_covariance[3:, 3:]))
+    assert 0.4 * sigma_m < np.sqrt(np.mean(off**2)) < 2.0 * sigma_m
 
 
 @pytest.mark.parametrize(
