@@ -429,11 +429,12 @@ class Estimator(Estimate):
         closure = self._loop_closure
         closure.note(self._state, stamp_ns)
         if closure.is_due(self._state, stamp_ns):
-            if closure.close(self._state, stamp_ns):
-                self._hypotheses.prune_to_best()
             # A map of its own, while it is sought in a loaded one, decides nothing of that.
             if not self._localiser.maps or self._localiser.is_localised:
+                before = self.counts['merged_landmark']
                 self._hypotheses.fork(closure.twins)
+                if (merged := self.counts['merged_landmark'] - before) > 1:
+                    logger.info('A loop has closed: %d landmarks were seen before.', merged)
             closure.count_doubled(self._state)
 
     def _start_again(self, distance_m: float) -> None:

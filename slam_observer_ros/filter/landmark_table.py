@@ -40,12 +40,6 @@ MIN_SHARE, MOST_SHARE = 0.1, 0.9
 it may be small, and a landmark that was seen each time may yet be hidden.
 """
 
-NEW_S, OLD_S = 60.0, 20.0
-"""A landmark is new for so long, and an old one was not seen for so long, seconds."""
-
-MIN_LOOP = 5
-"""New landmarks, and old ones, that can say by how they lie whether a loop has closed."""
-
 
 class Landmarks(NamedTuple):
     """Counts and stamps of n landmarks, changed in place."""
@@ -198,18 +192,6 @@ class LandmarkTable(LandmarkColumns):
         """As :meth:`.Landmarks.unseen_s`."""
         return self.columns.unseen_s(rows, stamp_ns)
 
-    def are_new(self, rows: IntArray, stamp_ns: int) -> BoolArray:
-        """Return which ``rows`` (m,) were first seen of late and are still about."""
-        is_new: BoolArray = to_s(stamp_ns - self.born_ns[rows]) < NEW_S
-        is_about: BoolArray = to_s(stamp_ns - self.last_seen_ns[rows]) < OLD_S
-        return is_new & is_about
-
-    def are_old(self, rows: IntArray, stamp_ns: int) -> BoolArray:
-        """Return which ``rows`` (m,) are not new, and were not seen of late."""
-        is_new: BoolArray = to_s(stamp_ns - self.born_ns[rows]) < NEW_S
-        is_about: BoolArray = to_s(stamp_ns - self.last_seen_ns[rows]) < OLD_S
-        return ~is_new & ~is_about
-
     def reject(self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray) -> None:
         """Count one more rejected observation of ``rows`` (m,).
 
@@ -263,6 +245,11 @@ class LandmarkTable(LandmarkColumns):
     def likely_share(self) -> float:
         """:attr:`seen_share` within likely limits."""
         return min(max(self.seen_share, MIN_SHARE), MOST_SHARE)
+
+    @property
+    def false_share(self) -> float:
+        """The probability that one just seen does not exist."""
+        return 1.0 / (1.0 + math.exp(self.prior))
 
     @property
     def tentative(self) -> BoolArray:

@@ -1,55 +1,48 @@
-"""Landmarks without ids that turn out to be one: near each other, or at the end of a loop.
+"""Landmarks without ids that turn out to be one: side by side, at the end of a loop, anywhere.
 
-After a loop the pose may be so uncertain that points pass for new landmarks. Where these lie to
-each other as old ones do, in one way only, they are those.
+After a loop the pose may be so uncertain that points pass for new landmarks. Which of all are one
+is asked of all pairs together, by the joint covariance: they share the errors of the poses from
+which they were seen, so where one pair is one, the others are known far better.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Set
-import logging
 import math
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
-from slam_observer_ros.filter.landmark_table import MIN_LOOP
+from slam_observer_ros.filter.landmark_table import LandmarkTable, SURE
 from slam_observer_ros.filter.robust import accepted
-from slam_observer_ros.lie.matrices import cholesky, mahalanobis
-from slam_observer_ros.mapping.merging import without_frame
-from slam_observer_ros.settings.estimator_settings import ERROR_PROBABILITY
+from slam_observer_ros.lie.matrices import mahalanobis
 from slam_observer_ros.tracking.hypothesis import Twins
+from slam_observer_ros.tracking.joint_compatibility import (
+    JointSearch,
+    Pairs,
+    PRUNING_COST_OF_IDS,
+)
 from slam_observer_ros.tracking.state import State
 
-logger = logging.getLogger(__name__)
-
 PERIOD_NS = 5_000_000_000  # time between two searches, nanoseconds
-MAX_SOUGHT = 12  # new landmarks that are looked for among old ones, those seen last
-MAX_OLD = 400  # old landmarks among which they are looked for: the nearest ones
-REACH = 4.0  # standard deviations of the pose within which a loop may close
-MOST = 4.0  # normalised square, per axis, of how far landmarks may be apart that are one
+MAX_CANDIDATES = 10  # landmarks that another one may be: the likeliest, if there are more
 
 # Standard deviation of how far apart they may be though exactly known, metres: no two views of a
 # thing have quite the same centre.
 LEAST_M = 0.01
 
-# Landmarks next to one to which distances say how well it is known where it lies there.
-NEIGHBOURS = 3
-
-
-HALF = 0.5  # share of how often two would be seen side by side from which on they are two
+NEIGHBOURS = 4  # landmarks next to one that say how many there are about it
 
 # −ln of the probability below which it is no chance that a landmark in view is not seen.
 SHOULD_BE_SEEN = 3.0
 
 
 class LoopClosure:
-    """Merges landmarks of one map that are one."""
+    """Finds landmarks of one map that are one."""
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
-        self._searched: tuple[bytes, int] | None = None
         self._apart: Counter[tuple[int, int]] = Counter()  # ids seen at once, side by side
         self._near_m = math.inf  # how far side by side is
         self._doubled: set[tuple[int, int]] = set()  # ids that were counted as such
@@ -74,28 +67,6 @@ class LoopClosure:
         self._last_ns = stamp_ns
         return True
 
-    def close(self, state: State, stamp_ns: int) -> bool:
-        """Merge new landmarks with old ones if they lie alike; return whether they do."""
-        landmarks, own = state.landmarks, _own(state)
-        new = own[landmarks.are_new(own, stamp_ns)]
-        old = own[landmarks.are_old(own, stamp_ns)]
-        if len(new) < MIN_LOOP or len(old) < MIN_LOOP:
-            return False
-        seen_ns = landmarks.last_seen_ns
-        new = np.sort(new[np.argsort(-seen_ns[new], kind='stable')][:MAX_SOUGHT])
-        old = _within_reach(state, new, old)
-        searched = (landmarks.ids[new].tobytes(), len(old))
-        if len(old) < MIN_LOOP or searched == self._searched:
-            return False
-        self._searched = searched
-        pairs = _pairs(state, new, old)
-        has_closed = pairs is not None and state.merge(*pairs, MOST) <= MOST
-        if pairs is not None and has_closed:
-            logger.info(
-                'A loop has closed: %d landmarks without ids were seen before.', len(pairs[0])
-            )
-        return has_closed
-
     def count_doubled(self, state: State) -> None:
         """Count landmarks that were added where known ones should be seen, and are not.
 
@@ -119,131 +90,110 @@ class LoopClosure:
         at, new = np.nonzero(is_since & (off_m < reach_m[:, None]))
         if not len(at):
             return
-        r, S = _differences(state, absent[at], added[new])
-        differ = ~accepted(mahalanobis(r, S), state.settings.rejection_threshold)
+        B = _blocks(state, np.concatenate([absent, added]))
+        r, new_at = points[absent[at]] - points[added[new]], len(absent) + new
+        differ = ~accepted(
+            mahalanobis(r, _of_differences(B, at, new_at, at, new_at)),
+            state.settings.rejection_threshold,
+        )
         pairs = np.column_stack([landmarks.ids[absent[at]], landmarks.ids[added[new]]])[differ]
         doubled = {(int(old), int(own)) for old, own in pairs} - self._doubled
         state.counts['doubled_landmark'] += len(doubled)
         self._doubled |= doubled
 
-    def twins(self, state: State, apart: Set[tuple[int, int]]) -> Twins | None:
-        """Return two landmarks that are likelier one than two, but for ids ``apart``."""
-        own = _own(state)
+    def twins(self, state: State, apart: Set[tuple[int, int]]) -> list[Twins]:
+        """Return which landmarks may be one: each likely answer, the likeliest first.
+
+        That none are is an answer, too. Ids ``apart`` are two landmarks.
+        """
+        rows, landmarks, k = state.confirmed, state.landmarks, state.axes.point
+        own = rows[is_automatic(landmarks.ids[rows])]
+        own = own[np.lexsort((landmarks.ids[own], landmarks.born_ns[own]))]
         if len(own) <= 2:
-            return None
-        from scipy.spatial import cKDTree  # which only points without ids need
-
-        landmarks, k = state.landmarks, state.axes.point
-        points = state.observer.points[own, :k]
-        tree = cKDTree(points)
+            return []
+        points, gate = state.observer.points[own, :k], state.settings.rejection_threshold
+        lengths_m = np.linalg.norm(points[:, None] - points, axis=2)
         # How many there are about each, but for a twin.
-        some = min(NEIGHBOURS + 2, len(own))
-        radii_m = tree.query(points, k=some)[0][:, -1]
-        unit = math.pi if k == 2 else 4.0 / 3.0 * math.pi
-        densities = (some - 1) / (unit * np.maximum(radii_m, LEAST_M) ** k)
+        some = min(NEIGHBOURS, len(own) - 1)
+        radii_m = np.partition(lengths_m, some, axis=1)[:, some]
         self._near_m = float(np.median(radii_m))
-        at = tree.query_pairs(self._near_m, output_type='ndarray')
-        first = np.minimum(own[at[:, 0]], own[at[:, 1]])
-        second = np.maximum(own[at[:, 0]], own[at[:, 1]])
-        ids = np.sort(np.column_stack([landmarks.ids[first], landmarks.ids[second]]), axis=1)
-        # Two are seen side by side whenever they are seen, but for what the sensor misses; one is
-        # where a false point is beside it.
-        p, beside = landmarks.likely_share, np.array([self._apart[a, b] for a, b in ids.tolist()])
-        alone = np.minimum(landmarks.counts[first], landmarks.counts[second]) - beside
-        may_be = beside < HALF * p * (alone + beside)
-        may_be &= landmarks.last_seen_ns[first] != landmarks.last_seen_ns[second]
-        may_be &= [(a, b) not in apart for a, b in ids.tolist()]
+        unit = math.pi if k == 2 else 4.0 / 3.0 * math.pi
+        log_densities = np.log(some / (unit * np.maximum(radii_m, LEAST_M) ** k))
+        # Pairs of an older and a later one that may be so near each other, …
+        B = _blocks(state, own)
+        shared = np.trace(B, axis1=2, axis2=3)
+        spread = np.add.outer(shared.diagonal(), shared.diagonal()) - 2.0 * shared
+        reach_m = gate * np.sqrt(np.maximum(spread, 0.0) + k * LEAST_M**2)
+        first, second = np.nonzero(np.triu(lengths_m <= reach_m, 1))
+        S = _of_differences(B, first, second, first, second)
+        distances = mahalanobis(points[first] - points[second], S)
+        order = np.lexsort((distances, second))
+        rank = np.arange(len(order)) - np.searchsorted(second[order], second[order])
+        near = np.sort(order[(rank < MAX_CANDIDATES) & accepted(distances[order], gate)])
+        first, second = first[near], second[near]
+        # … by how they were seen.
+        ids = np.sort(landmarks.ids[own][np.column_stack([first, second])], axis=1)
+        pairs = [(a, b) for a, b in ids.tolist()]
+        beside = np.array([self._apart[pair] for pair in pairs], dtype=np.int64)
+        evidence = _evidence(landmarks, own[first], own[second], beside)
+        may_be = np.array([pair not in apart for pair in pairs], dtype=np.bool_)
         if not may_be.any():
-            return None
-        at, first, second, alone = at[may_be], first[may_be], second[may_be], alone[may_be]
-        # How much likelier it is that they are one, there and not seen side by side.
-        r, S = _differences(state, first, second)
-        distances = mahalanobis(r, S)
-        may_be_one = accepted(distances, state.settings.rejection_threshold)
-        log_density = np.log(np.maximum(densities[at[:, 0]], densities[at[:, 1]]))
-        odds = -0.5 * (distances**2 + np.linalg.slogdet(2.0 * math.pi * S)[1]) - log_density
-        # Seen alone so often as one that was missed in a row: :meth:`.LandmarkTable.hidden`.
-        odds += np.log1p(p * np.maximum(alone, 0))
-        best = int(np.argmax(np.where(may_be_one, odds, -np.inf)))
-        if not may_be_one[best] or odds[best] <= 0.0:
-            return None
-        return Twins(first[[best]], second[[best]], float(odds[best]))
+            return []
+        first, second, evidence = first[may_be], second[may_be], evidence[may_be]
+        a, b = first[:, None], second[:, None]
+        S = _of_differences(B, a, b, first, second).swapaxes(1, 2).reshape((k * len(first),) * 2)
+        # Of second order, as the later ones lie turned to the others.
+        turn = float(np.max(np.diagonal(state.known_errors.pose_covariance())[:3]))
+        off_m = np.linalg.norm(points[second] - points[second].mean(axis=0), axis=1)
+        S += np.diag(np.repeat(0.75 * (turn * off_m) ** 2, k))
+        r, unit_noise = points[first] - points[second], np.eye(k) / (2.0 * math.pi)
+        search = JointSearch(
+            Pairs(second, first, r, S, np.tile(unit_noise, (len(first), 1, 1))),
+            np.zeros(len(first), dtype=np.bool_),
+            -2.0 * log_densities[second],
+            PRUNING_COST_OF_IDS,
+            pair_costs=-2.0 * evidence,
+        )
+        found, m = search.pairings(), len(np.unique(second))
+        # Back on old ground all are known ones, on new ground none: any number is as likely.
+        costs = [each.cost + 2.0 * math.log(math.comb(m, len(each.chosen))) for each in found]
+        return [
+            Twins(own[first[found[i].chosen]], own[second[found[i].chosen]], costs[i] - min(costs))
+            for i in np.argsort(costs, kind='stable')
+            if costs[i] <= min(costs) + 2.0 * SURE
+        ]
 
 
-def _own(state: State) -> IntArray:
-    """Return the rows of the landmarks in the map that have no id."""
-    rows = state.confirmed
-    return rows[is_automatic(state.landmarks.ids[rows])]
+def _evidence(
+    landmarks: LandmarkTable, rows: IntArray, others: IntArray, beside: IntArray
+) -> FloatArray:
+    """Return how much likelier (q,) landmarks are one than two, by how they were seen.
 
-
-def _within_reach(state: State, new: IntArray, old: IntArray) -> IntArray:
-    """Return the old landmarks (n,) that new ones (m,) may be."""
-    points = state.observer.points
-    centre = points[new].mean(axis=0)
-    radius_m = np.linalg.norm(points[new] - centre, axis=1).max()
-    off_m = np.linalg.norm(points[old] - centre, axis=1)
-    nearest = np.argsort(off_m, kind='stable')[:MAX_OLD]
-    old, off_m = old[nearest], off_m[nearest]
-    # Old landmarks that may lie among them, by how well it is known where these are to each other.
-    S = _differences(state, np.full(len(old), new[0]), old)[1]
-    spread_m = np.sqrt(np.trace(S, axis1=1, axis2=2))
-    return np.sort(old[off_m <= 2.0 * radius_m + REACH * spread_m])
-
-
-def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray] | None:
-    """Return which old landmarks (q,) are certainly which new ones (q,), if that is so."""
-    from slam_observer_ros.mapping.constellation import find_places  # which few runs need
-    from slam_observer_ros.mapping.landmark_map import MappedLandmarks
-    from slam_observer_ros.mapping.places import Anywhere, Constellation, Near
-
-    P = state.gains.joint_covariance(np.append(new, old))
-    if P is None:
-        return None
-    axes, points, p = state.axes, state.observer.points, state.axes.p
-    m, k = len(new), axes.point
-    blocks = P[p:, p:].reshape(m + len(old), k, -1, k).swapaxes(1, 2)
-    known = MappedLandmarks(points[old], _local_covariances(points[old], blocks[m:, m:]), axes)
-    # How the new ones lie to each other: where they are is not known.
-    G = axes.output_matrix(points[new] - points[new].mean(axis=0)).reshape(-1, axes.p)
-    of_new = P[p : p + m * k, p : p + m * k] + LEAST_M**2 * np.eye(m * k)
-    root = without_frame(cholesky(of_new), G)
-    shape = root @ root.T + LEAST_M**2 * np.eye(m * k)
-    seen = Constellation(points[new], shape, np.full(m, -1))
-    of_pose = state.known_errors.pose_covariance()
-    prior = Anywhere(known) if of_pose is None else Near(np.eye(4), of_pose, axes)
-    places = find_places(known, seen, prior, ERROR_PROBABILITY)
-    place = places.decided(ERROR_PROBABILITY)
-    if place is None or place.matches < MIN_LOOP:
-        return None
-    matched = place.rows >= 0
-    return old[place.rows[matched]], new[matched]
-
-
-def _local_covariances(points: FloatArray, blocks: FloatArray) -> FloatArray:
-    """Return how well it is known (n, 3, 3) where landmarks lie to those next to them.
-
-    ``blocks`` (n, n, k, k) is their joint covariance.
+    They were seen ``beside`` (q,) each other so often. Of two, the one that is missed each time
+    that the other is seen is hidden, as in :meth:`.LandmarkTable.hidden`; beside one alone there
+    are false points.
     """
-    n, k = blocks.shape[0], blocks.shape[2]
-    lines = points[:, None, :k] - points[None, :, :k]
-    lengths_m = np.linalg.norm(lines, axis=2)
-    np.fill_diagonal(lengths_m, np.inf)
-    near = np.argsort(lengths_m, axis=1)[:, :NEIGHBOURS]
-    a, b = np.repeat(np.arange(n), near.shape[1]), near.ravel()
-    u = lines[a, b] / np.maximum(lengths_m[a, b], LEAST_M)[:, None]
-    joint = blocks[a, a] + blocks[b, b] - blocks[a, b] - blocks[b, a]
-    variances = 0.5 * np.einsum('ai,aij,aj->a', u, joint, u).reshape(n, -1).mean(axis=1)
-    return np.asarray(np.maximum(variances, LEAST_M**2)[:, None, None] * np.eye(3))
+    counts, p = landmarks.counts, landmarks.likely_share
+    misses = np.maximum(landmarks.in_view - counts, 0)
+    alone = np.minimum(counts[rows] - beside, misses[others])
+    alone = np.maximum(alone + np.minimum(counts[others] - beside, misses[rows]), 0)
+    expected = landmarks.false_share * np.maximum(alone + beside, 1)
+    return np.asarray(np.log1p(p * alone) - beside * np.log1p(1.0 / expected))
 
 
-def _differences(state: State, rows: IntArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far landmarks (q,) are from others (q,): (q, k), and its covariances."""
-    k, p, q = state.axes.point, state.axes.p, len(rows)
-    both, at = np.unique(np.append(rows, others), return_inverse=True)
-    P = state.gains.joint_covariance(both)
+def _blocks(state: State, rows: IntArray) -> FloatArray:
+    """Return the joint covariance of landmarks (n,) in blocks (n, n, k, k)."""
+    P, k = state.gains.joint_covariance(rows), state.axes.point
     if P is None:
         raise TypeError('a filter without a joint covariance has no twins')
-    blocks = P[p:, p:].reshape(len(both), k, len(both), k).swapaxes(1, 2)
-    a, b = at[:q], at[q:]
-    S = blocks[a, a] + blocks[b, b] - blocks[a, b] - blocks[b, a] + LEAST_M**2 * np.eye(k)
-    return (state.observer.points[rows] - state.observer.points[others])[:, :k], S
+    p, n = state.axes.p, len(rows)
+    return np.asarray(P[p:, p:].reshape(n, k, n, k).swapaxes(1, 2))
+
+
+def _of_differences(
+    B: FloatArray, a: IntArray, b: IntArray, c: IntArray, d: IntArray
+) -> FloatArray:
+    """Return the covariance (…, k, k) of how far a is from b with how far c is from d."""
+    S = B[a, c] - B[a, d] - B[b, c] + B[b, d]
+    is_own = (np.equal(a, c) & np.equal(b, d))[..., None, None]
+    return np.asarray(S + is_own * LEAST_M**2 * np.eye(B.shape[2]))

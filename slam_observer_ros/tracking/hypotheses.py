@@ -42,7 +42,6 @@ from slam_observer_ros.tracking.interpretations import (
     may_name,
 )
 from slam_observer_ros.tracking.joint_compatibility import (
-    PRUNING_COST,
     pruning_cost,
     PRUNING_COST_OF_IDS,
     RESOLUTION,
@@ -160,27 +159,33 @@ class Hypotheses:
         self._all = self._all[:1]
         return self.best
 
-    def fork(self, find: Callable[[State, Set[tuple[int, int]]], Twins | None]) -> None:
-        """Take two landmarks for one where that is likelier; follow both views if it is not sure.
+    def fork(self, find: Callable[[State, Set[tuple[int, int]]], list[Twins]]) -> None:
+        """Take landmarks for one that are likely to be; follow each answer that may be right.
 
-        ``find`` returns such landmarks of a state, but for pairs of ids that are two in any case.
+        ``find`` returns these of a state, but for pairs of ids that are two in any case.
         """
         for hypothesis in list(self._all):
-            state = hypothesis.state
-            # Per axis, as merge() takes it: at the gate.
-            most = state.settings.rejection_threshold**2 / state.axes.point
-            while (twins := find(state, hypothesis.apart)) is not None:
-                pair = np.sort(state.landmarks.ids[np.append(twins.rows, twins.copies)])
-                apart = hypothesis.apart | {(int(pair[0]), int(pair[1]))}
-                is_sure = 2.0 * twins.log_odds > PRUNING_COST
-                other = None if is_sure else hypothesis.copy()
-                if state.merge(twins.rows, twins.copies, most) > most:
-                    hypothesis.apart = apart
-                elif other is not None:
-                    other.apart, other.cost = apart, other.cost + 2.0 * twins.log_odds
-                    _part((hypothesis, other), int(state.landmarks.last_seen_ns.max()))
-                    self._all.append(other)
+            most = hypothesis.state.settings.rejection_threshold**2 / hypothesis.state.axes.point
+            while (ways := find(hypothesis.state, hypothesis.apart)) and len(ways[0].rows):
+                ids = hypothesis.state.landmarks.ids
+                pairs = [_pairs(ids, way) for way in ways]
+                others = [hypothesis.copy() for _ in ways[1:]]
+                for one, way, own in zip((hypothesis, *others), ways, pairs, strict=True):
+                    one.apart |= frozenset().union(*pairs) - own
+                    one.cost += way.cost
+                    # Of three that are one, two at first; each per axis at the gate.
+                    first = ~np.isin(way.rows, way.copies)
+                    rows, copies = way.rows[first], way.copies[first]
+                    if len(rows) and one.state.merge(rows, copies, most) > most:
+                        one.apart |= own
+                if others:
+                    stamp_ns = int(hypothesis.state.landmarks.last_seen_ns.max())
+                    _part((hypothesis, *others), stamp_ns)
+                    self._all += others
         self._all = sorted(self._all, key=lambda one: one.cost)[: self._limit]
+        least_cost = self._all[0].cost
+        for hypothesis in self._all:
+            hypothesis.cost -= least_cost
 
     def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
@@ -537,6 +542,12 @@ def _part(hypotheses: Iterable[Hypothesis], stamp_ns: int) -> None:
     for number, hypothesis in enumerate(hypotheses):
         position = hypothesis.state.observer.pose[:3, 3].copy()
         hypothesis.path = (*hypothesis.path, Branch(number, stamp_ns, position))
+
+
+def _pairs(ids: IntArray, twins: Twins) -> frozenset[tuple[int, int]]:
+    """Return the ids of twins, the lower first."""
+    pairs = np.sort(np.column_stack([ids[twins.rows], ids[twins.copies]]), axis=1)
+    return frozenset((int(a), int(b)) for a, b in pairs)
 
 
 def _common(paths: Sequence[Sequence[Branch]]) -> list[Branch]:

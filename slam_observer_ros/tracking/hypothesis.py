@@ -238,11 +238,11 @@ class Visibility:
 
 @dataclass(frozen=True, slots=True)
 class Twins:
-    """Two landmarks that may be one."""
+    """One answer to which landmarks are one: these."""
 
-    rows: IntArray  # (1,) the one …
-    copies: IntArray  # (1,) … and the other, which goes
-    log_odds: float  # that they are one
+    rows: IntArray  # (q,) those that were seen first …
+    copies: IntArray  # (q,) … and those that they are, which go
+    cost: float  # −2 ln of its likelihood over the likeliest answer's
 
 
 @dataclass(frozen=True, slots=True)

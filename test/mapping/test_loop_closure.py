@@ -11,11 +11,11 @@ from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
+from slam_observer_ros.filter.landmark_table import ERROR, SURE
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking.hypotheses import Hypotheses
-from slam_observer_ros.tracking.joint_compatibility import PRUNING_COST
 from slam_observer_ros.tracking.state import State
 
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
@@ -58,39 +58,44 @@ def after_a_loop(points, seen, seed=0):
     return state, true_pose
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_a_loop_closes_where_new_landmarks_lie_to_each_other_as_old_ones(seed):
-    points, seen = points_in_a_hall(seed), np.arange(3, 10)
+def after_a_search(state, closure):
+    """All that is followed after a search of the map for landmarks that are one."""
+    hypotheses = Hypotheses(state)
+    hypotheses.fork(closure.twins)
+    return hypotheses
+
+
+@pytest.mark.parametrize(('seed', 'seen'), [(0, 3), (1, 3), (2, 5), (3, 9), (4, 9), (5, 9)])
+def test_a_loop_closes_where_new_landmarks_lie_to_each_other_as_old_ones(seed, seen):
+    """However many they are: few do where the drift is small."""
+    points, seen = points_in_a_hall(seed), np.arange(3, 3 + seen)
     state, true_pose = after_a_loop(points, seen, seed)
     before = np.abs(state.observer.pose - true_pose).max()
-    assert LoopClosure().close(state, LOOP_NS + 10**9)
+    closed = after_a_search(state, LoopClosure()).best
     assert before > 0.1
-    assert_allclose(state.observer.pose, true_pose, atol=0.1)
-    assert state.landmarks.ids.tolist() == (FIRST_AUTOMATIC_ID + np.arange(16)).tolist()
-    assert state.landmarks.counts[seen].tolist() == [18] * len(seen)
-    assert_allclose(state.observer.points, points, atol=0.1)
-    assert state.counts['merged_landmark'] == len(seen)
+    assert_allclose(closed.observer.pose, true_pose, atol=0.15)
+    assert closed.landmarks.ids.tolist() == (FIRST_AUTOMATIC_ID + np.arange(16)).tolist()
+    assert closed.landmarks.counts[seen].tolist() == [18] * len(seen)
+    assert_allclose(closed.observer.points, points, atol=0.15)
+    assert closed.counts['merged_landmark'] == len(seen)
 
 
-def test_no_loop_closes_where_new_landmarks_lie_as_many_old_ones_do():
+def test_where_new_landmarks_lie_as_many_old_ones_do_a_loop_stays_open():
     state, _ = after_a_loop(grid(), np.array([0, 1, 2, 4, 5, 6, 8, 9, 10]))
-    assert not LoopClosure().close(state, LOOP_NS + 10**9)
+    hypotheses = after_a_search(state, LoopClosure())
+    assert len(hypotheses) > 1
+    assert (hypotheses.weights > ERROR).all()
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_no_loop_closes_on_landmarks_that_are_others(seed):
+def test_a_loop_closes_on_landmarks_that_are_others_only_beside_one_that_stays_open(seed):
     state, _ = after_a_loop(points_in_a_hall(seed), np.arange(7), seed)
     rng = np.random.default_rng(seed)
     state.observer.y_ref[16:, :2] = state.observer.y_ref[16:, :2].mean(axis=0) + rng.uniform(
         -5.0, 5.0, (7, 2)
     )
-    assert not LoopClosure().close(state, LOOP_NS + 10**9)
-
-
-@pytest.mark.parametrize('seen', [4, 5])
-def test_it_takes_five_to_close_a_loop(seen):
-    state, _ = after_a_loop(points_in_a_hall(1), np.arange(seen))
-    assert LoopClosure().close(state, LOOP_NS + 10**9) == (seen >= 5)
+    hypotheses = after_a_search(state, LoopClosure())
+    assert max(len(one.landmarks) for one in hypotheses.states) == 23
 
 
 def twins(apart_m):
@@ -108,19 +113,12 @@ def twins(apart_m):
     return state
 
 
-def after_a_search(state, closure):
-    """All that is followed after a search of the map for landmarks that are one."""
-    hypotheses = Hypotheses(state)
-    hypotheses.fork(closure.twins)
-    return hypotheses
-
-
 def test_landmarks_that_may_be_one_are_followed_as_one_and_as_two():
     """Then later views decide; what was asked once is not asked again."""
-    state, closure = twins(0.07), LoopClosure()
+    state, closure = twins(0.11), LoopClosure()
     hypotheses = after_a_search(state, closure)
     assert [len(one.state.landmarks) for one in hypotheses._all] == [17, 18]
-    assert 0.0 < hypotheses._all[1].cost < PRUNING_COST
+    assert 0.0 < hypotheses._all[1].cost < 2.0 * SURE
     hypotheses.fork(closure.twins)
     assert [len(one.state.landmarks) for one in hypotheses._all] == [17, 18]
 
@@ -140,7 +138,8 @@ def test_two_landmarks_are_one_if_they_are_as_near_each_other_as_they_are_known(
 def test_two_landmarks_that_were_seen_at_once_side_by_side_are_two():
     state, closure = twins(0.02), LoopClosure()
     state.landmarks.last_seen_ns[-2:] = 7
-    closure.note(state, 7)
+    for _ in range(9):
+        closure.note(state, 7)
     state.landmarks.last_seen_ns[-1] = 9
     after_a_search(state, closure)
     assert state.counts['merged_landmark'] == 0
@@ -188,6 +187,6 @@ def test_that_a_loop_has_closed_is_logged(caplog):
     caplog.set_level('INFO', logger='slam_observer_ros')
     estimator._judge_map(LOOP_NS + 10**9)
     (line,) = (record.getMessage() for record in caplog.records)
-    assert line == 'A loop has closed: 7 landmarks without ids were seen before.'
+    assert line == 'A loop has closed: 7 landmarks were seen before.'
     estimator._judge_map(LOOP_NS + 2 * 10**9)
     assert len(caplog.records) == 1
