@@ -101,7 +101,11 @@ class Finder:
 
         None unless there is one place that fits, or if nothing much is new since the last search.
         """
-        if not (rows := self._rows(state)).size or not self._is_due(state, rows):
+        if not (rows := self._rows(state)).size:
+            return None
+        seen_so_often = math.log(float(state.landmarks.counts[rows].sum()))
+        last, self._searched = self._searched, (len(rows), int(seen_so_often / math.log(NEWS)))
+        if last == self._searched:  # nothing says more than the last time
             return None
         P = state.gains.joint_covariance(rows)
         if P is None:
@@ -175,14 +179,6 @@ class Finder:
             return np.empty(0, dtype=np.int64)
         return rows[np.argsort(-landmarks.last_seen_ns[rows], kind='stable')][:MAX_WEIGHED]
 
-    def _is_due(self, state: State, rows: IntArray) -> bool:
-        """Return whether a search may say more than the last one."""
-        seen_so_often = math.log(float(state.landmarks.counts[rows].sum()))
-        news = (len(rows), int(seen_so_often / math.log(NEWS)))
-        is_due = news != self._searched
-        self._searched = news
-        return is_due
-
     def _search(self, seen: Constellation, ids: IntArray) -> Places:
         """Search by the landmarks seen last, and weigh what fits by all of them."""
         reached = [known.mapped.within_reach(seen.points[:MAX_SOUGHT]) for known in self._maps]
@@ -238,11 +234,8 @@ class _SearchedMap:
         return Places.weighed(found, weighing.log_none, places.is_complete)
 
     def named(self, ids: IntArray) -> IntArray:
-        """Return the landmarks (m,) that ids name, −1 for none."""
-        known_ids = self.loaded.ids
-        order = np.argsort(known_ids)
-        at = order[np.searchsorted(known_ids, ids, sorter=order) % len(known_ids)]
-        return np.where((known_ids[at] == ids) & ~is_automatic(ids), at, -1)
+        """Return the landmarks (m,) that ids of a sensor name, −1 for none."""
+        return np.where(is_automatic(ids), -1, self.loaded.rows_of(ids))
 
 
 def _largest_mass(places: Places) -> float:

@@ -152,9 +152,14 @@ class HalfFinder:
         alike = [fit.pose for fit, *_ in fits if fit.cost < best.cost + margin]
         if axes.point == 2 and fits_mirrored(views, best, margin):
             self.in_a_line = known.ids[np.unique(views.named)].tolist()
-        elif len(alike) > 1:
+            return None
+        if len(alike) > 1:
             self.rivals = alike
-        elif _is_sure(best, views, axes):
+            return None
+        # It must be known so well that the filter can start with it.
+        distances_m = np.linalg.norm(views.landmarks - best.pose[:3, 3], axis=1)
+        turn_sigma = float(np.sqrt(np.trace(best.covariance[:3, :3]) / axes.turn))
+        if turn_sigma < SURE_RAD and best.place_sigma_m < SURE * float(np.median(distances_m)):
             scales = dict(zip(views.frames, best.scales.tolist(), strict=True))
             return Fix(best.pose, best.covariance, known, scales)
         return None
@@ -189,19 +194,11 @@ def fits_mirrored(views: Views, fit: Fit, margin: float) -> bool:
     return costs[1] < costs[0] + margin
 
 
-def _is_sure(fit: Fit, views: Views, axes: EstimatedAxes) -> bool:
-    """Return whether a pose is known so well that the filter can start with it."""
-    lines = views.landmarks - fit.pose[:3, 3]
-    distance_m = float(np.median(np.linalg.norm(lines, axis=1)))
-    turn_sigma = float(np.sqrt(np.trace(fit.covariance[:3, :3]) / axes.turn))
-    return turn_sigma < SURE_RAD and fit.place_sigma_m < SURE * distance_m
-
-
 def _views(window: Window, state: State, known: LandmarkMap) -> Views | None:
     """Return the views of landmarks that a map has, as seen from where the body is now."""
-    rows = {landmark_id: row for row, landmark_id in enumerate(known.ids.tolist())}
-    views = [view for view in window.views if view.landmark_id in rows]
-    named = np.array([rows[view.landmark_id] for view in views])
+    rows = known.rows_of(np.array([view.landmark_id for view in window.views], dtype=np.int64))
+    views = [view for view, row in zip(window.views, rows, strict=True) if row >= 0]
+    named = rows[rows >= 0]
     if len(views) < FEWEST_VIEWS or len(set(named.tolist())) < 2:
         return None
     back = se3.inverse(state.observer.A)
@@ -243,24 +240,19 @@ def find_poses(views: Views, axes: EstimatedAxes, scale_sigma: float) -> list[Fi
     T, s, costs = problem.descend(T, s, FIRST_STEPS)
     kept = np.argsort(costs, kind='stable')[:MOST_KEPT]
     T, s, costs = problem.descend(T[kept], s[kept], STEPS)
+    # Descents may have ended at the same pose.
+    apart: list[int] = []
+    for i in np.argsort(costs, kind='stable').tolist():
+        turned = np.linalg.norm(T[i, :3, :3] - T[apart, :3, :3], axis=(1, 2))
+        moved = np.linalg.norm(T[i, :3, 3] - T[apart, :3, 3], axis=1) / problem.span_m
+        if np.isfinite(costs[i]) and (np.maximum(turned, moved) > ONE).all():
+            apart.append(i)
     fits: list[Fit] = []
-    for i in _apart(T, costs, problem.span_m)[:MOST_FITTED]:
+    for i in apart[:MOST_FITTED]:
         fit = problem.fit(T[i], s[i])
         if fit is not None and not any(fit.is_same(other, axes) for other in fits):
             fits.append(fit)
     return sorted(fits, key=lambda fit: fit.cost)
-
-
-def _apart(T: FloatArray, costs: FloatArray, span_m: float) -> list[int]:
-    """Return poses (b, 4, 4) that descents have ended at, each once, the best one first."""
-    apart: list[int] = []
-    for i in np.argsort(costs, kind='stable').tolist():
-        turned = [np.linalg.norm(T[i, :3, :3] - T[j, :3, :3]) for j in apart]
-        moved = [np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]) / span_m for j in apart]
-        are_other = [max(pair) > ONE for pair in zip(turned, moved, strict=True)]
-        if np.isfinite(costs[i]) and all(are_other):
-            apart.append(i)
-    return apart
 
 
 class _Problem:
@@ -470,28 +462,29 @@ class _Problem:
 
     def starts(self) -> tuple[FloatArray, FloatArray]:
         """Return poses (b, 4, 4) of turns all around, and where views put the robot at each."""
-        R = _turns(self._axes)
+        if self._axes.turn == 1:
+            angles = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS
+            R = so3.exp(angles[:, None] * np.array([0.0, 0.0, 1.0]))
+        else:
+            from scipy.spatial.transform import Rotation  # which few runs need
+
+            R = Rotation.create_group('I').as_matrix()
         views, k = self._views, self._axes.point
         # Where the landmark would be seen from, if there was no way: 'virtual' landmarks.
         b = views.landmarks - np.einsum('hij,nj->hni', R, views.origins)
         middle = b.mean(axis=1, keepdims=True)
         b = (b - middle)[..., :k]  # (h, n, k)
-        centres = [self._linear(R, b)]
+        place, square = self._linear(R, b)
+        places = [place]
         if self._is_range.any():
             # Ranges may fit on the other side of these, too.
             _, axes = np.linalg.eigh(np.einsum('hni,hnj->hij', b, b))
             away = axes[:, :, 0]  # (h, k), the direction in which they are spread least
-            off = np.einsum('hi,hi->h', centres[0][0], away)[:, None] * away
-            level = centres[0][0] - off
-            rise = np.sqrt(np.maximum(centres[0][1] - (level**2).sum(axis=1), 0.0))
-            places = [
-                centres[0][0],
-                centres[0][0] - 2.0 * off,
-                level + rise[:, None] * away,
-                level - rise[:, None] * away,
-            ]
-        else:
-            places = [centres[0][0]]
+            off = np.einsum('hi,hi->h', place, away)[:, None] * away
+            level = place - off
+            rise = np.sqrt(np.maximum(square - (level**2).sum(axis=1), 0.0))
+            rise = rise[:, None] * away
+            places += [places[0] - 2.0 * off, level + rise, level - rise]
         T = np.tile(np.eye(4), (len(places) * len(R), 1, 1))
         T[:, :3, :3] = np.tile(R, (len(places), 1, 1))
         T[:, :3, 3] = np.tile(middle[:, 0], (len(places), 1))
@@ -534,14 +527,3 @@ class _Problem:
         N += (0.1 / size) ** 2 * np.eye(k + 1)
         solved = np.linalg.solve(N, np.einsum('hqi,hq->hi', A, right)[..., None])[..., 0]
         return solved[:, :k], solved[:, k] * size
-
-
-def _turns(axes: EstimatedAxes) -> FloatArray:
-    """Return turns (h, 3, 3) all around that are estimated."""
-    if axes.turn == 1:
-        angles = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS
-        return so3.exp(angles[:, None] * np.array([0.0, 0.0, 1.0]))
-    from scipy.spatial.transform import Rotation  # which few runs need
-
-    turns: FloatArray = Rotation.create_group('I').as_matrix()
-    return turns

@@ -74,6 +74,12 @@ class LandmarkMap:
             self.name,
         )
 
+    def rows_of(self, ids: IntArray) -> IntArray:
+        """Return the rows (m,) of landmarks by their ids (m,), −1 for ids that are not there."""
+        order = np.argsort(self.ids)
+        rows = order[np.searchsorted(self.ids, ids, sorter=order) % len(self.ids)]
+        return np.where(self.ids[rows] == ids, rows, -1)
+
     @property
     def tags(self) -> IntArray:
         """(t,) rows of landmarks with an orientation."""
@@ -106,27 +112,23 @@ class LandmarkMap:
         """
         if self.frame_id != other.frame_id or len(self.ids) != len(other.ids):
             return False
-        order, others = np.argsort(self.ids), np.argsort(other.ids)
-        if (self.ids[order] != other.ids[others]).any():
+        others = other.rows_of(self.ids)
+        if (others < 0).any():
             return False
-        variances = self.covariances_or(ROUNDED_M)[order] + other.covariances_or(ROUNDED_M)[others]
+        other = other.select(others)
+        variances = self.covariances_or(ROUNDED_M) + other.covariances_or(ROUNDED_M)
         deviations = np.sqrt(np.diagonal(variances, axis1=1, axis2=2)) + ROUNDED_M
-        off_m = np.abs(self.world_points[order] - other.world_points[others])
-        are_there = (off_m <= np.minimum(3.0 * deviations, SAME_M)).all()
-        return bool(are_there) and self._turns_as(other, order, others)
-
-    def _turns_as(self, other: LandmarkMap, order: IntArray, others: IntArray) -> bool:
-        """Return whether tags (n,) of two maps are turned alike, within their sigmas."""
+        off_m = np.abs(self.world_points - other.world_points)
+        if (off_m > np.minimum(3.0 * deviations, SAME_M)).any():
+            return False
+        # Tags are turned alike, within their sigmas.
         if self.orientations is None or other.orientations is None:
             return self.orientations is other.orientations
-        R, R_other = self.orientations[order], other.orientations[others]
         # Points, whose matrix is zero, only differ from tags.
-        off_rad = np.sqrt(0.5 * np.square(R - R_other).sum(axis=(1, 2)))
-        sigmas = np.zeros(len(order))
-        for each, rows in ((self, order), (other, others)):
-            if each.orientation_sigmas is not None:
-                sigmas = np.hypot(sigmas, each.orientation_sigmas[rows])
-        return bool((off_rad <= 3.0 * sigmas + ROUNDED_M).all())
+        off_rad = np.sqrt(0.5 * np.square(self.orientations - other.orientations).sum(axis=(1, 2)))
+        known = [each.orientation_sigmas for each in (self, other)]
+        squares = sum(sigmas**2 for sigmas in known if sigmas is not None)
+        return bool((off_rad <= 3.0 * np.sqrt(squares) + ROUNDED_M).all())
 
     def landmarks_in(self, T: FloatArray, sigma_m: float) -> KnownLandmarks:
         """Return the landmarks with covariances, or :meth:`covariances_or`, in another frame.

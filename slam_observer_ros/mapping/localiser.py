@@ -71,7 +71,7 @@ class Localiser:
         self.is_localised = True  # in the final frame: always, unless a map was loaded
         self.counts: Counter[str] = Counter()  # 'not_localised' observations, poses 'lost'
         self._trial: PoseTrial | None = None
-        self._comparisons = Comparisons()
+        self._observations = self._compared_at = self._shared = 0  # as :meth:`search` counts
         self._finder: Finder | None = None
         self._half_finder: HalfFinder | None = None
         self._rough: tuple[FloatArray, FloatArray] | None = None
@@ -121,8 +121,9 @@ class Localiser:
         self.loaded = self.maps[0] if len(self.maps) == 1 else None
         self._trial = self._finder = self._half_finder = self._rough = self._tag = None
         self._said_problem = False
-        self._comparisons, self._unexplained = Comparisons(), Unexplained()
-        self._contradiction, self._differences = Contradiction(), None
+        self._observations = self._compared_at = self._shared = 0
+        self._unexplained, self._contradiction = Unexplained(), Contradiction()
+        self._differences = None
 
     @property
     def is_contradicted(self) -> bool:
@@ -154,7 +155,16 @@ class Localiser:
         """
         if self.loaded is None:
             return None
-        is_elsewhere = self._is_elsewhere(state, update)
+        is_elsewhere = False
+        if self.is_localised and not state.is_mapping:
+            # Enough of a map that does not change says so, one after the other.
+            self._contradiction.confirm(update.ids[~update.rejected].tolist(), state.axes.point)
+            if self._contradiction.begins(update):
+                self.counts['contradicted_pose'] += 1
+                logger.warning('%s', found('contradicted_pose'))
+            is_elsewhere = self._contradiction.is_by(
+                state.axes.point, state.settings.max_rejections
+            )
         reason = None
         if self._trial is not None and self._trial.vote(update, state.settings.max_rejections):
             reason = 'most landmarks contradict the pose that was given'
@@ -173,23 +183,15 @@ class Localiser:
         self.counts['lost'] += reason is not None
         return reason
 
-    def _is_elsewhere(self, state: State, update: Update) -> bool:
-        """Return whether enough of a map that does not change says so, one after the other."""
-        if not self.is_localised or state.is_mapping:
-            return False
-        self._contradiction.confirm(update.ids[~update.rejected].tolist(), state.axes.point)
-        if self._contradiction.begins(update):
-            self.counts['contradicted_pose'] += 1
-            logger.warning('%s', found('contradicted_pose'))
-        return self._contradiction.is_by(state.axes.point, state.settings.max_rejections)
-
     def search(self, state: State) -> bool:
         """Enter the map after an observation, if it is time to compare; return whether it did."""
         if self.is_localised:
             return False
         ids = np.concatenate([known.ids for known in self.maps])
         shared = int(np.sum(state.landmarks.rows_of(ids) >= 0))
-        if self._comparisons.is_due(shared):
+        self._observations += 1
+        if shared != self._shared or self._observations >= (1.0 + NEWS) * self._compared_at:
+            self._shared, self._compared_at = shared, self._observations
             self.enter(state)
         if not self.is_localised:
             self._find(state)
@@ -260,7 +262,10 @@ class Localiser:
         looks = AlikeMaps([], likeness_by_ids) if self._finder is None else self._finder.alike
         if alike := self._alike.among(maps) or looks.among(maps):
             return alike
-        fits = ' and '.join(self._name(place, state.observer.A) for place in places[:MAX_NAMED])
+        named = [_where(place.transform @ state.observer.A) for place in places[:MAX_NAMED]]
+        if len(self.maps) > 1:
+            named = [f'{at} in {self.maps[i].name}' for at, i in zip(named, maps, strict=False)]
+        fits = ' and '.join(named)
         if len(places) > MAX_NAMED:
             fits += f' and {len(places) - MAX_NAMED} more'
         elif len(places) == 1:
@@ -317,11 +322,6 @@ class Localiser:
         """What is searched, in words."""
         return 'the map' if len(self.maps) == 1 else f'the {len(self.maps)} maps'
 
-    def _name(self, place: Place, A: FloatArray) -> str:
-        """Return where the robot is at a place, by Â (4, 4), in words."""
-        there = _where(place.transform @ A)
-        return there if len(self.maps) == 1 else f'{there} in {self.maps[place.map_index].name}'
-
 
 def _where(pose: FloatArray) -> str:
     """Return where a pose (4, 4) is, in words."""
@@ -344,21 +344,6 @@ def is_lost(state: State) -> bool:
 def is_rough(covariance: FloatArray) -> bool:
     """Return whether points without ids can't be matched by a pose with a covariance (6, 6)."""
     return bool((np.diagonal(covariance) > ROUGH_STD**2).any())
-
-
-class Comparisons:
-    """When a map is worth comparing with what was seen: that takes long, and seldom says more."""
-
-    def __init__(self) -> None:
-        self._observations = self._compared_at = self._shared = 0
-
-    def is_due(self, shared: int) -> bool:
-        """Count an observation; return whether to compare, now that ``shared`` landmarks are."""
-        self._observations += 1
-        if shared == self._shared and self._observations < (1.0 + NEWS) * self._compared_at:
-            return False
-        self._shared, self._compared_at = shared, self._observations
-        return True
 
 
 class PoseTrial:

@@ -60,6 +60,8 @@ def find_transform(
         few fit by chance, and determine the attitude.
 
     """
+    from scipy import special  # which few runs need; scipy.stats takes a second to import
+
     p, k = axes.p, axes.point
     J = axes.output_matrix(source).reshape(len(source) * k, p)
     G = np.vstack([np.eye(p), J])
@@ -69,7 +71,9 @@ def find_transform(
         rows = np.flatnonzero(np.append(np.ones(p, dtype=np.bool_), np.repeat(agree, k)))
         P = source_covariance[np.ix_(rows, rows)]
         known = target.select(agree)
-        T = _aligned(source[agree], P[p:, p:], known)
+        variances = np.diagonal(P[p:, p:]).reshape(-1, k).sum(axis=1)
+        variances = variances + np.trace(known.covariances, axis1=1, axis2=2) + JITTER_M2
+        T = rigid_alignment(source[agree], known.points, 1.0 / variances)
         # Compare them in the robot's frame: do they determine the attitude, do they agree?
         known = known.moved(se3.inverse(T))
         there = known.covariance_on(axes)
@@ -77,27 +81,11 @@ def find_transform(
         if _turn_std_rad(P, G[rows], there, axes) > MAX_TURN_STD_RAD:
             return None
         misfit, doubts = _contradictions(G[rows[p:]], P[p:, p:] + there, r)
-        if misfit <= _improbable(r.size - p):
+        if misfit <= special.chdtri(r.size - p, 2.0 * special.ndtr(-CONTRADICTION_SIGMAS)):
             return T, agree
         # Leave out the worst one.
         agree[np.flatnonzero(agree)[np.argmax(doubts)]] = False
     return None
-
-
-def _improbable(degrees_of_freedom: int) -> float:
-    """Return the χ² that is as improbable as ``CONTRADICTION_SIGMAS``."""
-    # scipy.stats has it too, but takes a second to import.
-    from scipy import special  # which few runs need
-
-    both_tails = 2.0 * special.ndtr(-CONTRADICTION_SIGMAS)
-    return float(special.chdtri(degrees_of_freedom, both_tails))
-
-
-def _aligned(source: FloatArray, own: FloatArray, target: KnownLandmarks) -> FloatArray:
-    """Return the transform (4, 4) that aligns landmarks weighted by how well each is known."""
-    variances = np.diagonal(own).reshape(len(source), -1).sum(axis=1)
-    variances = variances + np.trace(target.covariances, axis1=1, axis2=2) + JITTER_M2
-    return rigid_alignment(source, target.points, 1.0 / variances)
 
 
 def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import orth, solve_triangular
 
 from slam_observer_ros.common.errors import MapError
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
+from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.filter.known_landmarks import JITTER_M2, KnownLandmarks
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.matrices import (
@@ -56,9 +56,17 @@ def enter_map(
     that contradicts the others is taken as the map has it, and landmarks that only the estimate
     has are kept where mapping goes on.
     """
+    if pairs is None:
+        own = state.landmarks.rows_of(known.ids)
+        shared = np.flatnonzero((own >= 0) & ~is_automatic(known.ids))
+        pairs = own[shared], shared
+    rows, shared = pairs
     # The transform, by the landmarks that both have.
-    rows, shared = _with_same_ids(state, known) if pairs is None else pairs
-    found = _find_frame(state, rows, known.select(shared))
+    covariance = state.gains.joint_covariance(rows)
+    if covariance is None:
+        covariance = _of_constant_gains(state, rows)
+    target = known.select(shared).landmarks_in(np.eye(4), state.settings.map_noise)
+    found = find_transform(state.observer.points[rows], covariance, target, state.axes)
     if found is None:
         return False
     transform, agree = found
@@ -75,7 +83,13 @@ def enter_map(
     else:
         state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[agree]))
     # … and landmarks that only the map has are added.
-    _merge(state, known)
+    rows = state.landmarks.rows_of(known.ids)
+    merged, others = np.flatnonzero(rows >= 0), np.flatnonzero(rows < 0)
+    is_exact = state.settings.localization_mode == 'fixed'
+    taken = merged if is_exact else np.append(merged, others)
+    state.gains.enter_map(rows[merged], _in_reference_frame(state, known.select(taken)))
+    state.landmarks.counts[rows[merged]] += _counts(known.select(merged), state)
+    _complete(state, known, known.select(others))
     return True
 
 
@@ -124,18 +138,6 @@ def _lower_root(P: FloatArray) -> FloatArray:
     raise MapError('the covariance of the landmarks is not finite')
 
 
-def _find_frame(
-    state: State, rows: IntArray, known: LandmarkMap
-) -> tuple[FloatArray, BoolArray] | None:
-    """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
-    axes = state.axes
-    covariance = state.gains.joint_covariance(rows)
-    if covariance is None:
-        covariance = _of_constant_gains(state, rows)
-    target = known.landmarks_in(np.eye(4), state.settings.map_noise)
-    return find_transform(state.observer.points[rows], covariance, target, axes)
-
-
 def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
     """Return a covariance (p + m k, p + m k) of ε and m landmarks for gains that know none."""
     # The pose is exact, and each landmark as uncertain as if it was seen from here once.
@@ -146,27 +148,9 @@ def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
     return covariance
 
 
-def _merge(state: State, known: LandmarkMap) -> None:
-    """Correct the estimate by what a map knows of landmarks that both have; add its others."""
-    rows = state.landmarks.rows_of(known.ids)
-    merged, others = np.flatnonzero(rows >= 0), np.flatnonzero(rows < 0)
-    rows, is_exact = rows[merged], state.settings.localization_mode == 'fixed'
-    taken = merged if is_exact else np.append(merged, others)
-    state.gains.enter_map(rows, _in_reference_frame(state, known.select(taken)))
-    state.landmarks.counts[rows] += _counts(known.select(merged), state)
-    _complete(state, known, known.select(others))
-
-
 def _counts(known: LandmarkMap, state: State) -> IntArray:
     """Return how often landmarks of a map count as seen: a surveyed one is confirmed at once."""
     return np.asarray(np.maximum(known.counts, state.settings.confirmations))
-
-
-def _with_same_ids(state: State, known: LandmarkMap) -> tuple[IntArray, IntArray]:
-    """Return landmarks of an estimate, and which of a map's have the same ids of a sensor."""
-    rows = state.landmarks.rows_of(known.ids)
-    shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
-    return rows[shared], shared
 
 
 def _renumber(state: State, known: LandmarkMap, rows: IntArray, known_ids: IntArray) -> None:
@@ -185,19 +169,12 @@ def _renumber(state: State, known: LandmarkMap, rows: IntArray, known_ids: IntAr
 def _complete(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
     """Go on in a map, ``added`` the part of it that the state did not have."""
     mode = state.settings.localization_mode
-    if mode == 'fixed':
-        _fix(state, known, added)
+    if mode == 'fixed':  # all are where the map has them, and are left there
+        rows = known.rows_of(np.append(state.landmarks.ids, added.ids))
+        state.fix_landmarks(_in_reference_frame(state, known.select(rows)))
     state.landmarks.add_known(added.ids, _counts(added, state))
     state.is_mapping = mode == 'off'
     state.forget_past('the pose in the loaded map was found')
-
-
-def _fix(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
-    """Put the landmarks, and those added, where the map has them, and leave them there."""
-    order, ids = np.argsort(known.ids), np.append(state.landmarks.ids, added.ids)
-    rows = order[np.searchsorted(known.ids, ids, sorter=order)]
-    exact = _in_reference_frame(state, known.select(rows))
-    state.fix_landmarks(exact)
 
 
 def _in_reference_frame(state: State, known: LandmarkMap) -> KnownLandmarks:
@@ -219,13 +196,18 @@ def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
     rows = state.confirmed
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
     if state.observer.is_exact and loaded is not None:
-        return _exact_map(state, rows, loaded)
+        known = loaded.select(loaded.rows_of(state.landmarks.ids[rows]))
+        return replace(known, counts=state.landmarks.counts[rows])
+    R = None
+    if state.observer.orientations.are_known[rows].any():
+        B = state.known_errors.orientation_matrices(rows)
+        R = state.observer.reference_pose[:3, :3] @ B
     landmark_map = LandmarkMap(
         state.landmarks.ids[rows],
         state.observer.world_points[rows],
         None,
         state.landmarks.counts[rows],
-        orientations=_orientations_of(state, rows),
+        orientations=R,
     )
     return _with_covariances(landmark_map, state, rows, loaded is None)
 
@@ -255,20 +237,3 @@ def _with_covariances(
         orientation_sigmas=sigmas if len(tags) else None,
         joint_covariance=None if n > MAX_CORRELATED else joint,
     )
-
-
-def _exact_map(state: State, rows: IntArray, loaded: LandmarkMap) -> LandmarkMap:
-    """Return landmarks as the map has them that is taken to be exact."""
-    order = np.argsort(loaded.ids)
-    at = order[np.searchsorted(loaded.ids, state.landmarks.ids[rows], sorter=order)]
-    return replace(loaded.select(at), counts=state.landmarks.counts[rows])
-
-
-def _orientations_of(state: State, rows: IntArray) -> FloatArray | None:
-    """Return orientations (m, 3, 3) in the world."""
-    tags = state.observer.orientations
-    if not tags.are_known[rows].any():
-        return None
-    B = state.known_errors.orientation_matrices(rows)
-    world: FloatArray = state.observer.reference_pose[:3, :3] @ B
-    return world
