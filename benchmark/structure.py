@@ -20,6 +20,7 @@ from slam_observer_ros.cli.main import main as command_line
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.tracking.step import step
 
 PACKAGE = worlds.CHECKOUT / 'slam_observer_ros'
 TRACED_AFTER = 200
@@ -37,6 +38,8 @@ class TracedStep:
     functions, changes, depth : int
         How many functions are called, how often a call leads to another module, and how deep the
         stack of calls within the package is.
+    method : list of str
+        Names of the functions that ``tracking.step.step`` itself calls.
 
     """
 
@@ -44,22 +47,24 @@ class TracedStep:
     functions: int
     changes: int
     depth: int
+    method: list[str]
 
 
 def main() -> None:
     """Print all numbers."""
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
-    chain, step = longest_chain(), traced_step()
+    chain, traced = longest_chain(), traced_step()
     docstrings, lines = docstring_lines()
     rows = {
         'modules': len(modules()),
         'loose modules at the top': len(loose_modules()),
         'layers': layers(),
         'longest import chain': f'{len(chain)}: {" > ".join(chain)}',
-        'traced step, modules': f'{len(step.modules)}: {", ".join(step.modules)}',
-        'traced step, functions called': step.functions,
-        'traced step, changes of module': step.changes,
-        'traced step, depth': step.depth,
+        'traced step, modules': f'{len(traced.modules)}: {", ".join(traced.modules)}',
+        'traced step, functions called': traced.functions,
+        'traced step, changes of module': traced.changes,
+        'traced step, depth': traced.depth,
+        'calls of its method': f'{len(traced.method)}: {", ".join(traced.method)}',
         'traced velocity, functions called': traced_velocity().functions,
         'modules entered by replay --report': len(entered_by_a_report()),
         'lines': lines,
@@ -178,6 +183,7 @@ def entered_by_a_report() -> set[str]:
 def _traced(estimator: Estimator, event: Event) -> TracedStep:
     entered: list[str] = []
     stack: list[str] = []
+    method: list[str] = []
     counts = {'functions': 0, 'changes': 0, 'depth': 0}
 
     def note(frame: FrameType, kind: str, _argument: object) -> None:
@@ -186,6 +192,9 @@ def _traced(estimator: Estimator, event: Event) -> TracedStep:
             return
         module = path.removeprefix(f'{PACKAGE}/').removesuffix('.py')
         if kind == 'call':
+            caller = frame.f_back and frame.f_back.f_code
+            if caller is step.__code__ and frame.f_code.co_name not in method:
+                method.append(frame.f_code.co_name)
             if module not in entered:
                 entered.append(module)
             counts['functions'] += 1
@@ -200,7 +209,7 @@ def _traced(estimator: Estimator, event: Event) -> TracedStep:
         estimator.add(event)
     finally:
         sys.setprofile(None)
-    return TracedStep(entered, counts['functions'], counts['changes'], counts['depth'])
+    return TracedStep(entered, counts['functions'], counts['changes'], counts['depth'], method)
 
 
 if __name__ == '__main__':

@@ -42,6 +42,7 @@ from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_table import checked, table
 from slam_observer_ros.tracking.half_points import with_kinds
+from slam_observer_ros.tracking.step import step
 
 logger = logging.getLogger(__name__)
 
@@ -212,7 +213,10 @@ class Estimator(Estimate):
         """
         try:
             check_event(event, self.settings)
-            self._take(event)
+            if self._queue.passes(event):  # in stamp order, as nearly always
+                self._process(event)
+            else:
+                self._hold_back(event)
         except InvalidEventError as error:
             if error.reason == 'not_finite' and isinstance(event, ObservationEvent):
                 fit = are_finite(event)
@@ -235,7 +239,10 @@ class Estimator(Estimate):
         """
         if not self._are_usual(velocities):
             return sum(self.add(event) for event in velocities.events())
-        self._take(velocities)
+        if self._queue.passes(velocities):
+            self._process(velocities)
+        else:
+            self._hold_back(velocities)
         return len(velocities)
 
     def _are_usual(self, velocities: VelocityBlock) -> bool:
@@ -246,14 +253,11 @@ class Estimator(Estimate):
             return False
         return self._queue.follow(velocities)
 
-    def _take(self, item: Queued) -> None:
-        """Use an event that is right in itself, in its order.
+    def _hold_back(self, item: Queued) -> None:
+        """Hold an event back until its turn, and use those whose turn it is.
 
         Raise InvalidEventError if its stamp can't be right.
         """
-        if self._queue.passes(item):  # as nearly always
-            self._process(item)
-            return
         if self._queue.push(item):
             self.handle_clock_jump(item.stamp_ns - (self.newest_stamp_ns or 0))
             self._queue.push(item)
@@ -343,7 +347,8 @@ class Estimator(Estimate):
         self._timeline.advance_after_many()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        state, warnings = self._state, self._warnings
+        """Use an observation: by :func:`.step`, then for all that rides on it."""
+        state, warnings = self._hypotheses.best, self._warnings
         if event.kinds is not None and self.settings.two_d_mode:
             event = self._half_points.levelled(event, state.observation_noise)
         usable = usable_points(
@@ -351,13 +356,7 @@ class Estimator(Estimate):
         )
         if self._flood is not None or len(event.ids) > self.settings.max_points:
             self._forget_flood(event, usable)
-        event = self._timeline.synchronise(usable)
-        if event.kinds is not None:
-            is_lost = not self._localiser.is_localised
-            event = self._half_points.completed(event, self._state, is_lost=is_lost)
-        if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
-            self._placement.doubt(*self.uncertain_pose)
-        update = self._hypotheses.observe(event)
+        event, update = step(self._hypotheses, self._advance, usable)
         if event.kinds is not None:
             update = with_kinds(update, event)
             if self._half_points.remember(self._hypotheses.states):
@@ -372,6 +371,16 @@ class Estimator(Estimate):
         self.last_update = update
         if self._on_update is not None:
             self._on_update(update)
+
+    def _advance(self, event: ObservationEvent) -> ObservationEvent:
+        """Move the state on to an observation, or it to the state; return it, of whole points."""
+        event = self._timeline.synchronise(event)
+        if event.kinds is not None:
+            is_lost = not self._localiser.is_localised
+            event = self._half_points.completed(event, self._state, is_lost=is_lost)
+        if self._localiser.loaded is not None and self._localiser.may_be_rough(event):
+            self._placement.doubt(*self.uncertain_pose)
+        return event
 
     def _forget_flood(self, event: ObservationEvent, usable: ObservationEvent) -> None:
         """Forget what a flood of points has brought into the map, some time after its end.
@@ -396,7 +405,7 @@ class Estimator(Estimate):
         Return whether that may have moved the robot.
         """
         if self._localiser.is_localised:
-            self._warnings.two_places.note(self._state, event, update)
+            self._warnings.two_places.note(self._hypotheses.best, event, update)
         if self._localiser.maps:
             was_localised = self._localiser.is_localised
             self._placement.localise(event, update, self._half_points.window)
@@ -415,7 +424,7 @@ class Estimator(Estimate):
         some_are_unknown = bool(np.count_nonzero(event.ids == UNKNOWN_ID))
         if some_are_unknown:
             self._judge_map(event.stamp_ns)
-        distance_m = math.hypot(*self._state.observer.A[:3, 3].tolist())
+        distance_m = math.hypot(*self._hypotheses.best.observer.A[:3, 3].tolist())
         has_diverged = not distance_m <= DIVERGED_M  # or it is no number
         if has_diverged:
             self._start_again(distance_m)
@@ -445,7 +454,7 @@ class Estimator(Estimate):
 
     def _warn_of(self, event: ObservationEvent, update: Update) -> None:
         """Warn of an observation, of what it did, or of the map if something is wrong."""
-        warnings, state = self._warnings, self._state
+        warnings, state = self._warnings, self._hypotheses.best
         limit = self.settings.max_landmarks if state.is_mapping else 0
         if 0 < limit < len(event.ids):
             warnings.warn('more_than_max', count=len(event.ids), limit=limit)

@@ -10,7 +10,7 @@ well separated there is nearly always one hypothesis.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import takewhile
 import math
@@ -48,8 +48,7 @@ from slam_observer_ros.tracking.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.tracking.slip import MapViews, Slip, Standing
-from slam_observer_ros.tracking.state import State
-from slam_observer_ros.tracking.step import step
+from slam_observer_ros.tracking.state import Association, State
 
 AMBIGUOUS = 4.0
 """Deviation of the pose by all hypotheses, over what the best one states, in any direction, from
@@ -85,6 +84,9 @@ class _Child:
 class Hypotheses:
     """Hypotheses about pose and map, the most likely first; at the start there is one."""
 
+    best: State  # the most likely one
+    update: Update  # what the last observation did to it
+
     def __init__(self, state: State) -> None:
         self._earlier_counts = Outcomes()
         self._start(state)
@@ -95,7 +97,7 @@ class Hypotheses:
         self._start(state)
 
     def _start(self, state: State) -> None:
-        self._all = [Hypothesis.of(state)]
+        self._go_on_with([Hypothesis.of(state)])
         # Else points have ids, and are what these say.
         self._can_weigh = state.errors is not None
         self._limit = state.settings.max_hypotheses
@@ -108,6 +110,9 @@ class Hypotheses:
         self._delay_evidence = DelayEvidence()
         self._present: Ambiguity | None = None
         self._longest: Ambiguity | None = None
+
+    def _go_on_with(self, hypotheses: list[Hypothesis]) -> None:
+        self._all, self.best = hypotheses, hypotheses[0].state
 
     @property
     def ambiguity(self) -> Ambiguity | None:
@@ -139,11 +144,6 @@ class Hypotheses:
         return len(self._all)
 
     @property
-    def best(self) -> State:
-        """The most likely state."""
-        return self._all[0].state
-
-    @property
     def states(self) -> list[State]:
         """All states, the most likely one first."""
         return [hypothesis.state for hypothesis in self._all]
@@ -156,7 +156,7 @@ class Hypotheses:
     def prune_to_best(self) -> State:
         """Give up all hypotheses but the most likely one, and return its state."""
         self._views = None
-        self._all = self._all[:1]
+        self._go_on_with(self._all[:1])
         return self.best
 
     def fork(self, find: Callable[[State, Set[tuple[int, int]]], list[Twins]]) -> None:
@@ -182,7 +182,7 @@ class Hypotheses:
                     stamp_ns = int(hypothesis.state.landmarks.last_seen_ns.max())
                     _part((hypothesis, *others), stamp_ns)
                     self._all += others
-        self._all = sorted(self._all, key=lambda one: one.cost)[: self._limit]
+        self._go_on_with(sorted(self._all, key=lambda one: one.cost)[: self._limit])
         least_cost = self._all[0].cost
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
@@ -323,8 +323,8 @@ class Hypotheses:
         """Whether the wheels slip now."""
         return self._standing.slip is not None
 
-    def observe(self, event: ObservationEvent) -> Update:
-        """Use an observation made at their instant; return what it did to the best one."""
+    def judge_slip(self, event: ObservationEvent) -> ObservationEvent:
+        """Stop where the wheels spin; return an observation without landmarks that are carried."""
         standing = self._standing
         if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
             self._judge_standing(event)
@@ -334,9 +334,7 @@ class Hypotheses:
                 counts = hypothesis.state.counts
                 counts.note(Reason.CARRIED, event.ids[is_carried], event.stamp_ns)
             event = event.select(~is_carried)
-        update = self._observe(event)
-        self._note_ambiguity(event)
-        return update
+        return event
 
     def judge_views(self, ids: IntArray, covariances: FloatArray | None) -> bool:
         """Let the pose be less sure where views of a map contradict it; return whether they do.
@@ -401,7 +399,7 @@ class Hypotheses:
         return float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
 
     def _judge_standing(self, event: ObservationEvent) -> None:
-        """Stop where the wheels spin, and give up landmarks that the robot carries."""
+        """Look whether wheels spin, and give up landmarks that the robot carries."""
         standing, best = self._standing, self.best
         if not self._can_weigh or self._velocities is None:
             return
@@ -422,26 +420,35 @@ class Hypotheses:
                 state.counts['slip'] += slip.is_new
         return slip is not None
 
-    def _observe(self, event: ObservationEvent) -> Update:
-        """Use an observation of places."""
+    def associate(self, event: ObservationEvent) -> Iterator[Association]:
+        """Yield states with the landmarks that points are of; those that are updated remain.
+
+        Nearly always there is one state, and ids say which landmark is which. Points without ids,
+        and some that the gate mostly rejects, may mean several things; then each way is yielded.
+        """
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        is_clear = len(self._all) == 1 and not unknown and not may_name(self.best, event.ids)
+        best = self.best
+        is_clear = len(self._all) == 1 and not unknown and not may_name(best, event.ids)
         if is_clear or not self._can_weigh:
-            may_refuse = self._can_weigh and self._limit > 1
             if self._views is not None:
-                self._views.add(self.best, event)
-            if (update := step(self.best, event, may_refuse)) is not None:
-                return update
+                self._views.add(best, event)
+            may_refuse = self._can_weigh and self._limit > 1
+            rows = best.landmarks.rows_of(event.ids)
+            yield (one := Association(best, event, rows, may_refuse))
+            if not one.is_refused:
+                self.update, self._present = one.update, None
+                return
         # All hypotheses with all meanings; costs are differences to the most likely one.
         possible = self._interpret(event)
         number, likeliest = possible[0]
         if self._views is not None and not number and likeliest.slipped is None:
-            self._views.add(self.best, likeliest.event)
-        shown, children = self._all[0], self._follow(event, possible)
-        least_cost = children[0].hypothesis.cost
-        self._all = [child.hypothesis for child in children]
+            self._views.add(best, likeliest.event)
+        shown, children = self._all[0], list[_Child]()
+        yield from self._follow(event, possible, children)
+        children.sort(key=lambda child: child.hypothesis.cost)
+        self.update, least_cost = children[0].update, children[0].hypothesis.cost
+        self._go_on_with([child.hypothesis for child in children])
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
         if unknown and children[0].parent:
@@ -455,15 +462,17 @@ class Hypotheses:
         if unknown:
             visibility = self._all[0].visibility
             self._new_landmarks.note(event, visibility.sure_now + visibility.false_now)
-        return children[0].update
+        self._note_ambiguity(event)
 
     def _follow(
-        self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
-    ) -> list[_Child]:
-        """Let hypotheses use an observation as interpreted; return them, the cheapest first."""
+        self,
+        event: ObservationEvent,
+        possible: list[tuple[int, Interpretation]],
+        children: list[_Child],
+    ) -> Iterator[Association]:
+        """Yield each interpretation of an observation; append ``children`` as they come."""
         # A state is copied for each use of it but the last.
         uses = Counter(number for number, taken in possible if taken.slipped is None)
-        children: list[_Child] = []
         for number, taken in possible:
             hypothesis = self._all[number]
             if taken.slipped is not None:
@@ -472,8 +481,13 @@ class Hypotheses:
                 uses[number] -= 1
                 if uses[number]:
                     hypothesis = hypothesis.copy()
+            state = hypothesis.state
+            state.landmarks.renumber(taken.named_rows, taken.given_ids)
+            rows = state.landmarks.rows_of(taken.event.ids)
+            yield (one := Association(state, replace(event, ids=taken.event.ids), rows))
+            self._weigh(hypothesis, taken, event)
             # Of hypotheses that become one, the first stands for all.
-            child = self._child(hypothesis, number, taken, event)
+            child = _Child(hypothesis, number, taken.event, one.update)
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
             if len(children) == self._limit:
@@ -482,16 +496,12 @@ class Hypotheses:
             if count > 1:
                 same = (child.hypothesis for child in children if child.parent == number)
                 _part(same, event.stamp_ns)
-        return sorted(children, key=lambda child: child.hypothesis.cost)
 
-    def _child(
-        self, hypothesis: Hypothesis, parent: int, taken: Interpretation, event: ObservationEvent
-    ) -> _Child:
-        """Let a hypothesis use an observation as one interpretation has it."""
-        state = hypothesis.state
-        state.landmarks.renumber(taken.named_rows, taken.given_ids)
-        update = step(state, replace(event, ids=taken.event.ids))
-        hypothesis.cost = taken.cost
+    def _weigh(
+        self, hypothesis: Hypothesis, taken: Interpretation, event: ObservationEvent
+    ) -> None:
+        """Let a hypothesis, which took an observation in a way, cost what that is unlikely."""
+        hypothesis.cost, state = taken.cost, hypothesis.state
         if (event.ids == UNKNOWN_ID).any():
             visibility, ids = hypothesis.visibility, taken.event.ids
             if taken.evidence is not None:
@@ -500,7 +510,6 @@ class Hypotheses:
                     rows[rows >= 0], taken.evidence[rows >= 0]
                 )
             hypothesis.cost += visibility.note(state, taken.event, self._some_have_ids)
-        return _Child(hypothesis, parent, taken.event, update)
 
     def _interpret(self, event: ObservationEvent) -> list[tuple[int, Interpretation]]:
         """Return the interpretations by each hypothesis, by its number, the cheapest first.

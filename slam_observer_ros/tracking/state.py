@@ -10,11 +10,11 @@ import numpy as np
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.estimates import Change, NormalisedInnovation, Outcomes, Smoothed, Update
-from slam_observer_ros.filter.flat_arrays import Advanced, Interval
+from slam_observer_ros.estimates import Change, Outcomes, Smoothed, Update
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.filter.flat_arrays import Advanced, Interval, Observed, Seen
 from slam_observer_ros.filter.gains import Errors, Gains
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
-from slam_observer_ros.filter.observer import lyapunov
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.matrices import correlations_of
 from slam_observer_ros.models.held_velocities import Velocities
@@ -29,7 +29,7 @@ OLD_NEWS = 10.0
 
 
 class State:
-    """Pose and map as of one instant; :mod:`.step` moves it on."""
+    """Pose and map as of one instant; :mod:`.step` changes them."""
 
     def __init__(self, gains: Gains, settings: Settings) -> None:
         self.settings = settings  # those in force
@@ -150,28 +150,6 @@ class State:
         before = self.observer.A.copy()
         self.relinearisation.slip(before, self.gains.slip(after, covariance))
 
-    def update(
-        self,
-        stamp_ns: int,
-        ids: IntArray,
-        r: FloatArray,
-        rejected: BoolArray,
-        moved_ids: IntArray,
-        innovation: NormalisedInnovation | None,
-    ) -> Update:
-        """Return what an observation of m landmarks has done, given residuals r (m, 3) before."""
-        observer = self.observer
-        return Update(
-            stamp_ns,
-            observer.pose,
-            ids,
-            se3.rotate(observer.reference_pose, r),
-            rejected,
-            lyapunov(self.settings.gain_k, r),
-            moved_ids,
-            innovation,
-        )
-
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot to ``pose`` (4, 4), body to world, uncorrelated with the map from now on.
 
@@ -274,3 +252,26 @@ class State:
             calibration=calibration.estimates(np.diagonal(covariance), values),
             calibration_correlations=correlations_of(covariance),
         )
+
+
+class Association:
+    """Which landmarks of a ``state`` the points (m,) of an observation are of, and what it did.
+
+    ``rows`` (m,) are −1 for new landmarks. If it ``may_refuse``, it ``is_refused`` where most
+    points of known ones are rejected: nothing has changed then, and there is no ``update``.
+    """
+
+    known: BoolArray  # (m,) points of landmarks that were known before
+    seen: Seen  # what the filter was given …
+    out: Observed  # … and its answer
+    rejected: BoolArray  # (m,)
+    in_map: ObservationEvent  # the points whose landmarks are in the map by now …
+    at: IntArray  # … and the rows of these
+    in_doubt: BoolArray  # whether these were rejected too often
+    update: Update
+    is_refused = False
+
+    def __init__(
+        self, state: State, event: ObservationEvent, rows: IntArray, may_refuse: bool = False
+    ) -> None:
+        self.state, self.event, self.rows, self.may_refuse = state, event, rows, may_refuse

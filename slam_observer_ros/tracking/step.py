@@ -1,22 +1,24 @@
-"""One step of the observer: what an observation changes in a state."""
+"""One step of the observer: all that an observation changes."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, overload
+from collections.abc import Callable
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Change, NormalisedInnovation, Reason, Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.arrays import SeenOrientations
-from slam_observer_ros.filter.flat_arrays import Limits, Observed, Seen
+from slam_observer_ros.filter.flat_arrays import Limits, Seen
+from slam_observer_ros.filter.observer import lyapunov
 from slam_observer_ros.filter.robust import accepted
-from slam_observer_ros.lie import so3
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.sensor_mounting import Sensed, unmeasured_covariances
 from slam_observer_ros.models import sensing
 from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.tracking.matching import (
     calibrated,
     calibrated_again,
@@ -26,7 +28,7 @@ from slam_observer_ros.tracking.matching import (
     residuals_of,
     sensitivity,
 )
-from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.state import Association, State
 from slam_observer_ros.tracking.tags import (
     correct_by_orientations,
     seen_orientations,
@@ -36,79 +38,123 @@ from slam_observer_ros.tracking.tags import (
 NO_IDS = np.empty(0, dtype=np.int64)
 
 
-@overload
-def step(state: State, event: ObservationEvent) -> Update: ...
+def step(
+    hypotheses: Hypotheses,
+    advance: Callable[[ObservationEvent], ObservationEvent],
+    event: ObservationEvent,
+) -> tuple[ObservationEvent, Update]:
+    """Take one step of the observer: use an observation.
 
-
-@overload
-def step(state: State, event: ObservationEvent, may_refuse: bool) -> Update | None: ...
-
-
-def step(state: State, event: ObservationEvent, may_refuse: bool = False) -> Update | None:
-    """One step of the observer (28), from where the velocity has led it (27): the innovation.
-
-    Return what it did; None, with nothing changed, where the gate rejects most of the points, if
-    that ``may_refuse``: then the robot may not be where the state has it.
+    Numbers are the paper's equations, which docs/theory.md explains. ``advance`` moves all states
+    along the velocities to the observation; it returns the observation as it is seen from there.
+    Return that, too, and what the observation did to the most likely state.
     """
+    event = advance(event)  # (27)  X̂ along the velocity, and P with the noise of the motion
+    places = hypotheses.judge_slip(event)  # wheels that spin, landmarks that are carried along
+    for one in hypotheses.associate(places):  # landmarks of the points: nearly always in one way
+        if observe(one):  # (28)–(31)  residuals, gate, weights; the correction of X̂ and P
+            update_landmarks(one)  # new ones enter, rejections are counted
+            append(one)  # to the history, which is relinearised when it is due
+            one.update = follow_moved(one)  # landmarks that have moved, or that move (19)
+    return event, hypotheses.update
+
+
+def observe(one: Association) -> bool:
+    """Move a state by the innovation (28)–(31) of the known landmarks that are seen.
+
+    Return whether it was moved. It is not where most of the points are rejected and that
+    ``may_refuse``: then the robot may not be where the state has it.
+    """
+    state, event, rows = one.state, one.event, one.rows
+    settings, noise, gains = state.settings, state.observation_noise, state.gains
     if state.calibration.corrects_points and event.sensor_frame not in state.calibration.sensors:
         state.add_sensor(event.sensor_frame)
-    rows = state.landmarks.rows_of(event.ids)
+    one.known = known = rows >= 0
     # History depends on landmarks that will have to make room.
-    if len(_rows_to_forget(state, event, rows)):
+    if not known.all() and len(_rows_to_forget(state, event, rows)):
         state.forget_past('landmarks had to make room (max_landmarks)')
-    if event.orientations is not None and state.gains.tags is not None:
+    may_refuse = one.may_refuse
+    if event.orientations is not None and gains.tags is not None:
         matched = match(state, event)
-        gate = state.settings.rejection_threshold
-        are_near = accepted(state.gains.distances(matched.residuals), gate)
+        are_near = accepted(gains.distances(matched.residuals), settings.rejection_threshold)
         if may_refuse and is_contradiction(~are_near):
-            return None
+            one.is_refused = True
+            return False
         may_refuse = False
         correct_by_orientations(state, matched, are_near)  # φ_i = log(R_Â Z_i B̂_iᵀ)
+    limits = Limits(
+        gate=settings.rejection_threshold,
+        huber=settings.huber_threshold,
+        error_time_s=noise.error_time_s,
+        confirmations=settings.confirmations,
+        max_rejections=settings.max_rejections,
+        may_refuse=may_refuse,
+    )
+    seen, before = _seen(state, event, rows), state.observer.A.copy()
     # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°;  (30), (31)  X̂ ← (D, d_i) · X̂
-    corrected = correct(state, event, rows, may_refuse)
-    if corrected is None:
-        return None
-    known, innovation = rows >= 0, innovation_of(state, corrected)
-    rejected = known & (corrected.out.weights == 0.0)
-    ids, r = event.ids[known], corrected.out.r[known]
-    moved_ids = _follow_landmarks(state, event, corrected, rejected)
-    return state.update(event.stamp_ns, ids, r, rejected[known], moved_ids, innovation)
+    out = gains.observe(seen, noise.figures, limits, state.judges_innovations)
+    if out is None:
+        one.is_refused = True
+        return False
+    state.relinearisation.note_correction(before, state.observer.A)
+    one.seen, one.out, one.rejected = seen, out, known & (out.weights == 0.0)
+    return True
 
 
-def _follow_landmarks(
-    state: State, event: ObservationEvent, corrected: Corrected, rejected: BoolArray
-) -> IntArray:
-    """Count, add, relocate and keep what was seen; return ids of landmarks that have moved."""
-    rows, shown = corrected.rows, event
-    known, some_rejected = rows >= 0, bool(np.count_nonzero(rejected))
-    all_known = np.count_nonzero(known) == len(rows)
-    if not all_known or some_rejected or event.orientations is not None:
-        shown = calibrated(state, event)
-    if known.any():
-        all_rejected = np.count_nonzero(rejected) == np.count_nonzero(known)
-        state.rejected_in_a_row = state.rejected_in_a_row + 1 if all_rejected else 0
-        state.was_contradicted = some_rejected and is_contradiction(rejected[known])
-    if some_rejected:
-        _reject(state, shown.select(rejected), rows[rejected], corrected.out.r[rejected])
+def update_landmarks(one: Association) -> None:
+    """Count landmarks that were rejected, add those that are new, and how tags are turned."""
+    state, event, known, rejected = one.state, one.event, one.known, one.rejected
+    number, rejections = int(np.count_nonzero(known)), int(np.count_nonzero(rejected))
+    all_known, has_turns = number == len(known), event.orientations is not None
+    if not all_known or rejections or has_turns:
+        event = calibrated(state, event)
+    if number:
+        state.rejected_in_a_row = state.rejected_in_a_row + 1 if rejections == number else 0
+        state.was_contradicted = rejections > 0 and is_contradiction(rejected[known])
+    if rejections:
+        _reject(state, event.select(rejected), one.rows[rejected], one.out.r[rejected])
     if not all_known:
-        rows = _add_new(state, shown, rows)  # y_i° = Â y_i
-    kept = rows >= 0
-    in_map, at = (shown, rows) if kept.all() else (shown.select(kept), rows[kept])
-    if event.orientations is not None:
-        take_over_orientations(state, in_map, at)  # B̂_i = R_Â Z_i
+        one.rows = _add_new(state, event, one.rows)  # y_i° = Â y_i
+    kept = one.rows >= 0
+    one.in_map, one.at = event, one.rows
+    if not kept.all():
+        one.in_map, one.at = event.select(kept), one.rows[kept]
+    if has_turns:
+        take_over_orientations(state, one.in_map, one.at)  # B̂_i = R_Â Z_i
+
+
+def append(one: Association) -> None:
+    """Keep what was seen of the map's landmarks, to be linearised again."""
+    state, settings = one.state, one.state.settings
     # After the correction it is known better where doubtful landmarks were seen.
-    in_doubt = state.landmarks.in_doubt(at, state.settings.max_rejections) & state.is_mapping
-    some_in_doubt = bool(np.count_nonzero(in_doubt))
-    if state.relinearisation.is_active and len(at):
-        has_turns = event.orientations is not None
-        turns = seen_orientations(state, in_map, at) if has_turns else None
-        state.keep(keyframe(state, event, corrected, rows, turns), some_in_doubt)
+    in_doubt = state.landmarks.in_doubt(one.at, settings.max_rejections) & state.is_mapping
+    one.in_doubt = in_doubt
+    if state.relinearisation.is_active and len(one.at):
+        has_turns = one.event.orientations is not None
+        turns = seen_orientations(state, one.in_map, one.at) if has_turns else None
+        state.keep(keyframe(one, turns), bool(np.count_nonzero(in_doubt)))
+
+
+def follow_moved(one: Association) -> Update:
+    """Relocate landmarks that have moved, and let those move that do; return what was done."""
+    state, event, known, r = one.state, one.in_map, one.known, one.out.r
     moved_ids = NO_IDS
-    if some_in_doubt:
-        in_map = calibrated(state, in_map)
-        moved_ids = _relocate_moved(state, in_map.select(in_doubt), at[in_doubt])
-    _set_velocities(state, in_map, at)  # (19)
-    return moved_ids
+    if np.count_nonzero(one.in_doubt):
+        event = calibrated(state, event)
+        moved_ids = _relocate_moved(state, event.select(one.in_doubt), one.at[one.in_doubt])
+    if event.velocities is not None or state.observer.have_moved:
+        _set_velocities(state, event, one.at)
+    observer = state.observer
+    return Update(
+        event.stamp_ns,
+        observer.pose,
+        one.event.ids[known],
+        se3.rotate(observer.reference_pose, r[known]),
+        one.rejected[known],
+        lyapunov(state.settings.gain_k, r[known]),
+        moved_ids,
+        innovation_of(one) if state.judges_innovations else None,
+    )
 
 
 def _reject(state: State, event: ObservationEvent, rows: IntArray, r: FloatArray) -> None:
@@ -165,11 +211,9 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
 
 def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> None:
     """Let landmarks move as the sensor says; by one that says nothing they are static."""
-    velocities = event.velocities
-    if velocities is None and state.observer.have_moved:
-        velocities = np.zeros((len(rows), 3))
-    if velocities is None or state.landmark_velocity_stddev:
+    if state.landmark_velocity_stddev:
         return
+    velocities = np.zeros((len(rows), 3)) if event.velocities is None else event.velocities
     used = state.landmarks.rejections[rows] == 0
     state.observer.set_landmark_velocities(rows[used], velocities[used])
 
@@ -184,38 +228,6 @@ def _rows_to_forget(state: State, event: ObservationEvent, rows: IntArray) -> In
         return NO_IDS
     unseen = state.landmarks.unseen_since(event.stamp_ns)
     return np.sort(unseen[~np.isin(unseen, rows)][:excess])
-
-
-class Corrected(NamedTuple):
-    """An observation as the filter was given it, and its effect."""
-
-    rows: IntArray  # (m,) which landmarks its points are of, −1 for new ones
-    seen: Seen
-    out: Observed
-
-
-def correct(
-    state: State, event: ObservationEvent, rows: IntArray, may_refuse: bool = False
-) -> Corrected | None:
-    """Correct a state by the points (m,) of known landmarks ``rows``, −1 where one is new.
-
-    Return None, with nothing changed, where most are rejected and that ``may_refuse``.
-    """
-    settings, noise = state.settings, state.observation_noise
-    limits = Limits(
-        gate=settings.rejection_threshold,
-        huber=settings.huber_threshold,
-        error_time_s=noise.error_time_s,
-        confirmations=settings.confirmations,
-        max_rejections=settings.max_rejections,
-        may_refuse=may_refuse,
-    )
-    seen, before = _seen(state, event, rows), state.observer.A.copy()
-    out = state.gains.observe(seen, noise.figures, limits, state.judges_innovations)
-    if out is None:
-        return None
-    state.relinearisation.note_correction(before, state.observer.A)
-    return Corrected(rows, seen, out)
 
 
 def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
@@ -262,20 +274,15 @@ def _plain(array: FloatArray) -> FloatArray:
     return np.ascontiguousarray(array, np.float64)
 
 
-def keyframe(
-    state: State,
-    event: ObservationEvent,
-    corrected: Corrected,
-    rows: IntArray,
-    turns: SeenOrientations | None,
-) -> Keyframe:
+def keyframe(one: Association, turns: SeenOrientations | None) -> Keyframe:
     """Return the points as they are kept to be linearised again, of landmarks ``rows`` by now.
 
     Without those whose landmark is not in the map, −1. ``turns`` are of the others.
     """
-    seen, out, sensed = corrected.seen, corrected.out, event.sensed
+    event, seen, out, rows = one.event, one.seen, one.out, one.rows
+    sensed = event.sensed
     if seen.sensor is not None:
-        number = state.calibration.sensors.index(event.sensor_frame)
+        number = one.state.calibration.sensors.index(event.sensor_frame)
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
         sensed = Sensed(np.full(len(rows), number), origins, seen.arms, event.orientations)
     covariances = out.covariances if len(out.covariances) else None
@@ -297,18 +304,16 @@ def keyframe(
     return every if np.count_nonzero(kept) == len(rows) else every.select(kept)
 
 
-def innovation_of(state: State, corrected: Corrected) -> NormalisedInnovation | None:
-    """Return how far off the residuals of known landmarks were, if that was asked for."""
-    out, known = corrected.out, corrected.rows >= 0
-    if not len(out.judged):
-        return None
+def innovation_of(one: Association) -> NormalisedInnovation:
+    """Return how far off the residuals of known landmarks were."""
+    state, out, known = one.state, one.out, one.known
     weights = out.weights[known]
     if state.errors is None:
         nothing, unlikely = np.zeros(len(weights)), np.full(len(weights), -np.inf)
         return NormalisedInnovation(nothing, weights, None, 0, unlikely, np.ones(len(weights)))
     distances, densities, shares = out.judged[:-1].reshape(3, -1)[:, known]
     nis, used = float(out.judged[-1]), weights > 0.0
-    count, directions = int(np.count_nonzero(used)) * state.axes.point, corrected.seen.directions
+    count, directions = int(np.count_nonzero(used)) * state.axes.point, one.seen.directions
     if directions is not None:
         count = int(np.count_nonzero(directions[known][used, : state.axes.point].any(axis=2)))
     return NormalisedInnovation(

@@ -33,9 +33,9 @@ from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.runs.metrics import average_nees, pose_errors
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking import step as state_step
 from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.step import step as take_step
 
 
 @hypothesis_settings(max_examples=20)
@@ -160,7 +160,7 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
     seen, speed = np.array([[5.0, 0.0, 0.0]]), np.array([[4.0, 0.0, 0.0]])
     event = ObservationEvent(START_NS + 10**8, np.array([1]), seen, velocities=speed)
     if is_estimated:
-        hypotheses.observe(replace(event, stamp_ns=timeline.state_ns))
+        take_step(hypotheses, timeline.synchronise, replace(event, stamp_ns=timeline.state_ns))
         hypotheses.best.observer.u[0] = so3.exp(0.1 * turning[:3]) @ speed[0]
         event = replace(event, velocities=None)
     carried = timeline.synchronise(event)
@@ -278,7 +278,7 @@ def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
     settings = Settings(confirmations=1)
     state = State(make_gains(settings, np.eye(4)), settings)
     event = observation(0.0, [0, 1])
-    state_step.step(state, event)
+    take_step(Hypotheses(state), lambda seen: seen, event)
     state.observer.body_points = Mock(return_value=event.points)
     velocities = VelocityHistory(timeout_ns=10**9)
     velocities.append(velocity(0.0, np.zeros(6)))

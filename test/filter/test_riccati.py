@@ -32,8 +32,8 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
-from slam_observer_ros.tracking.state import State
-from slam_observer_ros.tracking.step import correct
+from slam_observer_ros.tracking.state import Association, State
+from slam_observer_ros.tracking.step import observe as observe_by_state
 
 CALIBRATED = replace(PLAIN, angular_bias_stddev=(0.02,) * 3, linear_scale_stddev=(0.1,) * 3)
 
@@ -172,10 +172,10 @@ def test_an_observation_needs_no_more_memory_than_a_few_times_that_of_the_covari
     riccati.add(points, random_covariances(rng, landmarks, 3))
     V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
     seen = ObservationEvent(0, rows, points[rows], random_covariances(rng, len(rows), 3))
-    state = State(riccati, PLAIN)
+    one = Association(State(riccati, PLAIN), seen, rows)
     tracemalloc.start()
     propagate(riccati, V, np.full(3, 0.1), Q)
-    correct(state, seen, rows)
+    assert observe_by_state(one)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 3 * riccati.joint.P.nbytes

@@ -12,8 +12,8 @@ from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking.state import State
-from slam_observer_ros.tracking.step import correct
+from slam_observer_ros.tracking.state import Association, State
+from slam_observer_ros.tracking.step import observe as observe_by_state
 
 PLAIN = Settings(
     huber_threshold=0.0,
@@ -76,8 +76,9 @@ def observe(
 ) -> FloatArray:
     """Correct a filter by landmarks (m,) seen at ``points`` (m, 3); return their weights."""
     seen = ObservationEvent(0, rows, points, covariances)
-    corrected = correct(State(filter_, filter_._settings), seen, rows)
-    return corrected.out.weights
+    one = Association(State(filter_, filter_._settings), seen, rows)
+    assert observe_by_state(one)
+    return one.out.weights
 
 
 def as_stated(points: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -51,7 +51,7 @@ def told_reset(self, *pose):
     reset(self, *pose)
 
 Estimator.reset = told_reset
-Hypotheses.observe = fail
+Hypotheses.associate = fail
 Estimator.load_map = fail
 Estimator.change_settings = fail
 Estimator.set_pose = fail

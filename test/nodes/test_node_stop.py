@@ -25,7 +25,7 @@ import time
 from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.nodes.executables import observer_node
 
-observe, seen = Hypotheses.observe, []
+associate, seen = Hypotheses.associate, []
 
 def slow(self, event):
     seen.append(event)
@@ -34,9 +34,9 @@ def slow(self, event):
         end_s = time.monotonic() + 60.0
         while time.monotonic() < end_s:
             pass
-    return observe(self, event)
+    return associate(self, event)
 
-Hypotheses.observe = slow
+Hypotheses.associate = slow
 sys.exit(observer_node())
 """
 

@@ -577,7 +577,7 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     covariances, costs = roots @ roots.swapaxes(1, 2), np.array([0.0, 1.0, 3.0])
     hypotheses = Hypotheses(State(make_gains(settings, np.eye(4)), settings))
     first = hypotheses._all[0]
-    hypotheses._all = [replace(first.copy(), cost=cost) for cost in costs.tolist()]
+    hypotheses._go_on_with([replace(first.copy(), cost=cost) for cost in costs.tolist()])
     for hypothesis, pose, covariance in zip(hypotheses._all, poses, covariances, strict=True):
         hypothesis.state.set_pose(pose, covariance)
     weights = np.exp(-costs / 2.0) / np.exp(-costs / 2.0).sum()

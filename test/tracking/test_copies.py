@@ -71,7 +71,7 @@ def test_a_copy_of_a_state_and_the_state_change_apart_and_alike(run):
         one.add(event)
         other.add(event)
     before = known_of(one)
-    other._hypotheses._all = [one._hypotheses._all[0].copy()]
+    other._hypotheses._go_on_with([one._hypotheses._all[0].copy()])
     for event in events[half:]:
         other.add(event)
     np.testing.assert_equal(known_of(one), before)
@@ -102,7 +102,7 @@ def test_a_deep_copy_of_an_estimator_has_one_owner_too(run):
     for event in events[half:]:
         one.add(event)
         other.add(event)
-    other._hypotheses._all = [hypothesis.copy() for hypothesis in other._hypotheses._all]
+    other._hypotheses._go_on_with([each.copy() for each in other._hypotheses._all])
     np.testing.assert_equal(known_of(one), known_of(other))
 
 

@@ -22,8 +22,8 @@ from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
 from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.tracking import hypotheses, step
-from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking import step
+from slam_observer_ros.tracking.state import Association, State
 
 BENCHMARK = Path(__file__).resolve().parents[2] / 'benchmark'
 WORLDS = (
@@ -96,10 +96,12 @@ class BothWays:
         self._monkeypatch = monkeypatch
         self.observed = self.moved = self.asked = 0
         self.entered = self.rejected = self.refused = 0
-        self._advance, self._poses, self._observe = State.advance, State.poses_until, step.step
+        self._advance, self._poses, self._observe = State.advance, State.poses_until, step.observe
         monkeypatch.setattr(State, 'advance', lambda *args: self.advance(*args))
         monkeypatch.setattr(State, 'poses_until', lambda *args: self.poses(*args))
-        monkeypatch.setattr(hypotheses, 'step', self.observe)
+        monkeypatch.setattr(step, 'observe', self.observe)
+        self._finish = step.follow_moved
+        monkeypatch.setattr(step, 'follow_moved', self.finish)
 
     def by_numpy(self, way, *args):
         with self._monkeypatch.context() as without_core:
@@ -124,18 +126,26 @@ class BothWays:
         self.asked += 1
         return found
 
-    def observe(self, state, event, may_refuse=False):
-        other, before = state.copy(), state.copy()
+    def observe(self, one):
+        state, before = one.state, one.state.copy()
+        self._other = other = Association(state.copy(), one.event, one.rows, one.may_refuse)
         self.observed += 1
-        update = self._observe(state, event, may_refuse)
-        expected = self.by_numpy(self._observe, other, event, may_refuse)
-        assert_same(state, other, f'the observation at {event.stamp_ns}')
-        assert state.counts == other.counts
-        if update is None:
-            assert expected is None
+        is_used = self._observe(one)
+        assert self.by_numpy(self._observe, other) == is_used
+        assert_same(state, other.state, f'the observation at {one.event.stamp_ns}')
+        if not is_used:
             assert_same(state, before, 'a refused observation')
             self.refused += 1
-            return None
+        return is_used
+
+    def finish(self, one):
+        state, other, event = one.state, self._other, one.event
+        update = self._finish(one)
+        self.by_numpy(step.update_landmarks, other)
+        self.by_numpy(step.append, other)
+        expected = self.by_numpy(self._finish, other)
+        assert_same(state, other.state, f'the landmarks at {event.stamp_ns}')
+        assert state.counts == other.state.counts
         np.testing.assert_array_equal(update.ids, expected.ids)
         np.testing.assert_allclose(update.residuals, expected.residuals, atol=1e-12)
         np.testing.assert_array_equal(update.rejected, expected.rejected)
