@@ -163,7 +163,9 @@ class _Search:
             where += T[alive, :k, 3]
             limit_m = float(np.max(radius_m, initial=0.0))
             distances, near = known.tree.query(where, distance_upper_bound=limit_m)
-            hit = _is_hit(distances <= radius_m, near, seen.only[at], rows[alive])
+            # It is near, may be meant, and is no other point already.
+            hit = (distances <= radius_m) & ((seen.only[at] < 0) | (seen.only[at] == near))
+            hit &= ~(rows[alive] == near[:, None]).any(axis=1)
             rows[alive[hit], at[hit]] = near[hit]
             missed[alive[~hit]] += 1
             alive = alive[missed[alive] <= m - matches]
@@ -175,7 +177,8 @@ class _Search:
         for q in np.argsort(-counts, kind='stable'):
             if not self._could_matter(int(counts[q])):
                 return True
-            if any(_is_part_of(rows[q], place.rows) for place in self.found):
+            # Another place may have all its matches.
+            if any(((rows[q] == place.rows) | (rows[q] < 0)).all() for place in self.found):
                 continue
             self.places_left -= 1
             if self.places_left < 0:
@@ -202,7 +205,14 @@ class _Sides:
         joint = own[:, None] + own[None] - blocks - transpose(blocks)
         variances = np.einsum('abi,abij,abj->ab', u, joint, u)
         self._deviations_m = np.sqrt(np.maximum(variances, 0.0))
-        self._order = self._by_use()
+        # Those first that make good bases: far apart, well known
+        precise = self.lengths_m / np.maximum(self._deviations_m, 1e-3)
+        order = list(np.unravel_index(np.argmax(precise), precise.shape))
+        while len(order) < m:
+            nearest_m = self.lengths_m[:, order].min(axis=1)
+            nearest_m[order] = -1.0
+            order.append(np.argmax(nearest_m))
+        self._order = np.array(order, dtype=np.int64)
 
     @property
     def longest_m(self) -> float:
@@ -222,47 +232,30 @@ class _Sides:
         a, b = np.array(list(combinations(base.tolist(), 2))).T
         return self.lengths_m[a, b], GATE * self._deviations_m[a, b]
 
-    def _by_use(self) -> IntArray:
-        """Return the points (m,), those first that make good bases: far apart, well known."""
-        precise = self.lengths_m / np.maximum(self._deviations_m, 1e-3)
-        order = list(np.unravel_index(np.argmax(precise), precise.shape))
-        while len(order) < len(precise):
-            nearest_m = self.lengths_m[:, order].min(axis=1)
-            nearest_m[order] = -1.0
-            order.append(np.argmax(nearest_m))
-        return np.array(order, dtype=np.int64)
-
 
 class _Gates:
     """How far from where b bases put them the other points may be."""
 
     def __init__(self, bases: IntArray, known: MappedLandmarks, seen: Constellation) -> None:
         self.bases, m, k = bases, len(seen), known.axes.point
+        J, blocks = known.axes.output_matrix(seen.points), seen.covariance.reshape(m, k, m, k)
+        owns = diagonal_blocks(seen.covariance, k)
         others, radii = [], []
         for base in bases:
             rest = np.setdiff1d(np.arange(m), base)
-            radii_m = self._radii_m(base, rest, known, seen)
+            # Of a point's own error, and what the base's error adds: (m − k, k, k k)
+            moved = -J[rest] @ np.linalg.pinv(J[base].reshape(-1, known.axes.p))
+            of_base = blocks[base][:, :, base].reshape(k * len(base), -1)
+            of_base = of_base + np.kron(np.eye(len(base)), known.largest_covariance)
+            cross = blocks[rest][:, :, base].reshape(len(rest), k, -1) @ transpose(moved)
+            own = owns[rest] + known.largest_covariance
+            total = own + moved @ of_base @ transpose(moved) + cross + transpose(cross)
+            radii_m = GATE * np.sqrt(np.linalg.eigvalsh(total)[:, -1])
             order = np.argsort(radii_m)  # the surest first
             others.append(rest[order])
             radii.append(radii_m[order])
         self.others: IntArray = np.array(others, dtype=np.int64).reshape(-1, m - k)
         self.radii_m: FloatArray = np.array(radii).reshape(-1, m - k)
-
-    @staticmethod
-    def _radii_m(
-        base: IntArray, rest: IntArray, known: MappedLandmarks, seen: Constellation
-    ) -> FloatArray:
-        """Return the radii (m − k,): of a point's own error, and what the base's error adds."""
-        axes, m, k = known.axes, len(seen), known.axes.point
-        J = axes.output_matrix(seen.points)
-        moved = -J[rest] @ np.linalg.pinv(J[base].reshape(-1, axes.p))  # (m − k, k, k k)
-        blocks = seen.covariance.reshape(m, k, m, k)
-        of_base = blocks[base][:, :, base].reshape(k * len(base), -1)
-        of_base = of_base + np.kron(np.eye(len(base)), known.largest_covariance)
-        cross = blocks[rest][:, :, base].reshape(len(rest), k, -1) @ transpose(moved)
-        own = diagonal_blocks(seen.covariance, k)[rest] + known.largest_covariance
-        total = own + moved @ of_base @ transpose(moved) + cross + transpose(cross)
-        return np.asarray(GATE * np.sqrt(np.linalg.eigvalsh(total)[:, -1]))
 
 
 def _aligned(source: FloatArray, target: FloatArray, axes: EstimatedAxes) -> FloatArray:
@@ -282,14 +275,3 @@ def _aligned(source: FloatArray, target: FloatArray, axes: EstimatedAxes) -> Flo
         T[:, :3, :3] = U @ Vt
     T[:, :3, 3] = target_centre - np.einsum('hij,hj->hi', T[:, :3, :3], source_centre)
     return T
-
-
-def _is_hit(is_near: BoolArray, near: IntArray, only: IntArray, taken: IntArray) -> BoolArray:
-    """Return which landmarks (h,) are near, may be meant, and are not taken (h, m) already."""
-    may_be = (only < 0) | (only == near)
-    return np.asarray(is_near & may_be & ~(taken == near[:, None]).any(axis=1))
-
-
-def _is_part_of(rows: IntArray, other: IntArray) -> bool:
-    """Return whether another place has all the matches (m,) of a place."""
-    return bool(((rows == other) | (rows < 0)).all())

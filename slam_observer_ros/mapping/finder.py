@@ -68,9 +68,8 @@ def warn_of_symmetry(loaded: LandmarkMap, name: str) -> None:
 
 def _likeness(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
     """Return how a map is to be moved to look as another, if their ids have not said so."""
-    if likeness_by_ids(known, other) is not None:
-        return None
-    found = turns_onto(known, other)
+    by_ids = likeness_by_ids(known, other)
+    found = [] if by_ids is not None else turns_onto(known, other)
     return max(found, key=lambda each: int(each.is_same.sum()), default=None)
 
 
@@ -277,7 +276,11 @@ def look_around(
     poses = _poses(known.world_points, fov_rad)
     results = []
     for pose in poses:
-        points = _seen(known.world_points, pose, view_m, fov_rad)
+        points = se3.transform(se3.inverse(pose), known.world_points)
+        ranges_m = np.linalg.norm(points[:, :2], axis=1)
+        bearings = np.abs(np.arctan2(points[:, 1], points[:, 0]))
+        in_view = np.flatnonzero((ranges_m <= view_m) & (bearings <= 0.5 * fov_rad))
+        points = points[in_view[np.argsort(ranges_m[in_view])][:MAX_SEEN]]
         covariance = sigma_m**2 * np.eye(axes.point * len(points))
         constellation = Constellation(points, covariance, np.full(len(points), -1))
         if len(points) <= axes.point:
@@ -303,13 +306,3 @@ def _poses(points: FloatArray, fov_rad: float) -> FloatArray:
     yaws = 2.0 * math.pi * np.arange(headings) / headings
     turns = so3.exp(np.column_stack([np.zeros((headings, 2)), yaws]))
     return np.array([se3.pose(R, position) for position in at for R in turns])
-
-
-def _seen(points: FloatArray, pose: FloatArray, view_m: float, fov_rad: float) -> FloatArray:
-    """Return the nearest points (m, 3) in view, body frame."""
-    points = se3.transform(se3.inverse(pose), points)
-    ranges_m = np.linalg.norm(points[:, :2], axis=1)
-    bearings = np.abs(np.arctan2(points[:, 1], points[:, 0]))
-    in_view = np.flatnonzero((ranges_m <= view_m) & (bearings <= 0.5 * fov_rad))
-    nearest: FloatArray = points[in_view[np.argsort(ranges_m[in_view])][:MAX_SEEN]]
-    return nearest

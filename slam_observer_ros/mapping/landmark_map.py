@@ -186,7 +186,18 @@ class MappedLandmarks:
             self.reach_m = min(1.2 * distance_m, self._most_m)
             while self.tree.count_neighbors(self.tree, self.reach_m) > 2 * MAX_PAIRS:
                 self.reach_m = self._most_m = 0.8 * self.reach_m
-            self._sort_pairs()
+            # All pairs up to the reach, by distance, and by their first landmark as well
+            pairs = self.tree.query_pairs(self.reach_m, output_type='ndarray').astype(np.int32)
+            lines = self.points[pairs[:, 0]] - self.points[pairs[:, 1]]
+            distances = np.sqrt(np.einsum('ij,ij->i', lines, lines))
+            order = np.argsort(distances)
+            self._pairs: IntArray = pairs[order]
+            self._distances: FloatArray = distances[order]
+            if self.axes.point == 3:
+                keys = self._key(pairs.T, distances).ravel()
+                by_first = np.argsort(keys)
+                self._keys: FloatArray = keys[by_first]
+                self._partners: IntArray = pairs.T[::-1].ravel()[by_first]
         return self.reach_m
 
     def within_reach(self, points: FloatArray) -> IntArray:
@@ -219,37 +230,17 @@ class MappedLandmarks:
         if counts.sum() > MAX_TRIPLES:
             return None
         pairs = np.repeat(pairs, counts, axis=0)
-        third = self._partners[_ranges(first, counts)]
+        before = np.cumsum(counts) - counts
+        third = self._partners[np.arange(int(counts.sum())) + np.repeat(first - before, counts)]
         lines = self.points[pairs[:, 1]] - self.points[third]
         off_m = np.sqrt(np.einsum('ij,ij->i', lines, lines)) - sides_m[2]
         fits: BoolArray = (np.abs(off_m) <= tolerances_m[2]) & (third != pairs[:, 1])
         found: IntArray = np.column_stack([pairs[fits], third[fits]])
         return found[:, corners]
 
-    def _sort_pairs(self) -> None:
-        """Keep all pairs up to the reach, by distance, and by their first landmark as well."""
-        pairs = self.tree.query_pairs(self.reach_m, output_type='ndarray').astype(np.int32)
-        lines = self.points[pairs[:, 0]] - self.points[pairs[:, 1]]
-        distances = np.sqrt(np.einsum('ij,ij->i', lines, lines))
-        order = np.argsort(distances)
-        self._pairs: IntArray = pairs[order]
-        self._distances: FloatArray = distances[order]
-        if self.axes.point == 3:
-            keys = self._key(pairs.T, distances).ravel()
-            by_first = np.argsort(keys)
-            self._keys: FloatArray = keys[by_first]
-            self._partners: IntArray = pairs.T[::-1].ravel()[by_first]
-
     def _key(self, first: IntArray, distances_m: FloatArray | float) -> FloatArray:
         """Return numbers that sort pairs by their first landmark, then by distance."""
         return np.asarray(first * (2.0 * self.reach_m + 1.0) + distances_m)
-
-
-def _ranges(first: IntArray, counts: IntArray) -> IntArray:
-    """Return the numbers of ranges that begin at ``first`` (q,), one range after the other."""
-    before = np.cumsum(counts) - counts
-    ranges: IntArray = np.arange(int(counts.sum())) + np.repeat(first - before, counts)
-    return ranges
 
 
 def heights_of(maps: Iterable[LandmarkMap]) -> dict[int, float]:

@@ -255,22 +255,26 @@ def _parse(content: Any) -> LandmarkMap:
     )
     _expect(isinstance(rows, list), "'landmarks' is not a list")
     _expect(len(rows) > 0, 'it has no landmarks')
-    ids = [_landmark_id(row, index) for index, row in enumerate(rows)]
+    ids = []
+    for index, row in enumerate(rows):
+        who = f'entry {index} of landmarks'
+        _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
+        _check_names(who, row, ('id', 'position'), _OPTIONAL)
+        landmark_id = _natural(row['id'], f"{who}: 'id'")
+        _expect(landmark_id <= MAX_ID, f"{who}: 'id' is {landmark_id}, beyond {MAX_ID}")
+        ids.append(landmark_id)
     for landmark_id, times in Counter(ids).items():
         _expect(times == 1, f'landmark {landmark_id} is there {times} times')
+    points, counts = [], []
+    for row in rows:
+        who = f'landmark {row["id"]}'
+        points.append(_numbers(row['position'], 3, f"{who}: 'position'"))
+        counts.append(_natural(row.get('observations', 0), f"{who}: 'observations'"))
     landmark_map = LandmarkMap(
         np.array(ids, dtype=np.int64),
-        np.array(
-            [_numbers(row['position'], 3, f"landmark {row['id']}: 'position'") for row in rows]
-        ),
+        np.array(points),
         _covariances(rows),
-        np.array(
-            [
-                _natural(row.get('observations', 0), f"landmark {row['id']}: 'observations'")
-                for row in rows
-            ],
-            dtype=np.int64,
-        ),
+        np.array(counts, dtype=np.int64),
         frame_id,
         *_orientations(rows),
     )
@@ -278,15 +282,6 @@ def _parse(content: Any) -> LandmarkMap:
         return landmark_map
     joint = _correlations(content['correlations'], rows, landmark_map.covariances)
     return dataclasses.replace(landmark_map, joint_covariance=joint)
-
-
-def _landmark_id(row: Any, index: int) -> int:
-    who = f'entry {index} of landmarks'
-    _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
-    _check_names(who, row, ('id', 'position'), _OPTIONAL)
-    landmark_id = _natural(row['id'], f"{who}: 'id'")
-    _expect(landmark_id <= MAX_ID, f"{who}: 'id' is {landmark_id}, beyond {MAX_ID}")
-    return landmark_id
 
 
 def _orientations(
@@ -399,8 +394,8 @@ def _correlations(
         _expect(is_whole, 'they are not of the form {checksum: …, data: …}')
         is_of_these = content['checksum'] == _checksum(landmarks)
         _expect(is_of_these, 'a landmark was added, removed, moved or changed since')
-        tags = sum('orientation' in row for row in landmarks)
         _expect(covariances is not None, 'the landmarks have no covariances')
+        tags = sum('orientation' in row for row in landmarks)
         joint = _decoded(content['data'], 3 * (len(landmarks) + tags))
         check_joint(joint, np.asarray(covariances))
     except MapError as error:

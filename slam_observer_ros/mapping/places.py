@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -132,22 +132,11 @@ class Places:
         return max(1.0 - self.all[0].share, 1e-12) if self.all else 1.0
 
 
-class PlacePrior(Protocol):
-    """What is known beforehand of where a constellation is."""
-
-    def log_density(self, transform: FloatArray, covariance: FloatArray) -> float:
-        """Return ln of the density, over rad and m, at a transform (4, 4) that is uncertain.
-
-        ``covariance`` (p, p) has its turn and position on the axes that are estimated.
-        """
-
-    @property
-    def largest(self) -> float:
-        """The largest that it can be."""
-
-
 class Anywhere:
-    """Nothing is known but that it is somewhere in the map."""
+    """Nothing is known beforehand but that a constellation is somewhere in the map.
+
+    ``largest`` is ln of the largest density, over rad and m.
+    """
 
     def __init__(self, known: MappedLandmarks) -> None:
         axes = known.axes
@@ -156,7 +145,10 @@ class Anywhere:
         self.largest = -float(np.log(sides_m).sum()) - math.log(turns)
 
     def log_density(self, transform: FloatArray, covariance: FloatArray) -> float:
-        """Return ln of the density, which is the same everywhere."""
+        """Return ln of the density at a transform (4, 4): it is the same everywhere.
+
+        ``covariance`` (p, p) has its turn and position on the axes that are estimated.
+        """
         return self.largest
 
 
@@ -175,6 +167,9 @@ class Near:
         P = self._P + covariance
         log_det = float(np.linalg.slogdet(2.0 * math.pi * P)[1])
         return -0.5 * (float(off @ solve_symmetric(P, off)) + log_det)
+
+
+PlacePrior: TypeAlias = Anywhere | Near
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,15 +229,13 @@ class Weighing:
         centre = se3.transform(fit.transform, self._centre[None])[:, : known.axes.point]
         in_view = len(known.tree.query_ball_point(centre[0], self._view_m))
         mass = self._mass(fit.log_likelihood, n, max(n, in_view))
-        mass += self._prior.log_density(fit.transform, self._covariance(fit))
-        return Place(fit.transform, rows, mass)
-
-    def _covariance(self, fit: _Fit) -> FloatArray:
-        """Return the covariance (p, p) of a fit's turn and position."""
-        pose, J = self._known.axes.pose, np.eye(6)
+        # Its turn and position, from those about the centre of the matches
+        J = np.eye(6)
         J[3:, :3] = so3.hat(fit.centre - fit.transform[:3, 3])
-        J = J[pose, pose]
-        return np.asarray(J @ solve_symmetric(fit.information, J.T))
+        J = J[known.axes.pose, known.axes.pose]
+        covariance = np.asarray(J @ solve_symmetric(fit.information, J.T))
+        mass += self._prior.log_density(fit.transform, covariance)
+        return Place(fit.transform, rows, mass)
 
     def _fit(self, transform: FloatArray, rows: IntArray) -> _Fit | None:
         """Fit a place to its matches (m,); None if these are too few."""
