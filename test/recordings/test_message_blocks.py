@@ -13,16 +13,22 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 import numpy as np
 from numpy.testing import assert_array_equal
+import pytest
 import ros_messages as ros
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import get_typestore, Stores
 from strategies import generators
 
 from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import VelocityBlock
 from slam_observer_ros.recordings import reader
 from slam_observer_ros.recordings.mcap_source import McapSource
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.sources import in_blocks, RawBlock
 from slam_observer_ros.recordings.topics import TopicNames
+from slam_observer_ros.settings.estimator_settings import Settings
 
 STEP_NS = 20_000_000
 TYPES = ('Twist', 'TwistStamped', 'TwistWithCovarianceStamped', 'Odometry')
@@ -40,6 +46,26 @@ def write_mcap(path, messages, chunk_size):
                 channels[topic] = writer.register_channel(topic, 'cdr', schema)
             writer.add_message(channels[topic], received_ns, data, received_ns)
         writer.finish()
+
+
+def write_sqlite(directory, messages):
+    with rosbag2.Writer(directory, version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
+        write_bag(bag, messages, ros.TYPESTORE, lambda data, _: data)
+    return directory
+
+
+def write_ros1(path, messages):
+    with rosbag1.Writer(path) as bag:
+        write_bag(bag, messages, get_typestore(Stores.ROS1_NOETIC), ros.TYPESTORE.cdr_to_ros1)
+    return path
+
+
+def write_bag(bag, messages, typestore, converted):
+    connections = {}
+    for topic, message_type, received_ns, data in messages:
+        if topic not in connections:
+            connections[topic] = bag.add_connection(topic, message_type, typestore=typestore)
+        bag.write(connections[topic], received_ns, bytes(converted(data, message_type)))
 
 
 def one_by_one(items):
@@ -160,6 +186,38 @@ def test_velocities_in_blocks_are_those_one_by_one(rng, message_type, oddities):
             value = getattr(event, field.name)
             assert_array_equal(value, getattr(same, field.name), err_msg=field.name)
             assert type(value) is type(getattr(same, field.name))
+
+
+def estimated(path):
+    """All bits that are estimated of a recording, and how many velocities came in blocks."""
+    estimator, in_blocks_count = Estimator(Settings(confirmations=1)), 0
+    with Recording(path) as recording:
+        for item in recording.blocks(recording.find_topics(TopicNames(velocity='/odom'))):
+            if isinstance(item, VelocityBlock):
+                in_blocks_count += len(item)
+                estimator.add_velocities(item)
+            else:
+                estimator.add(item)
+    estimator.flush()
+    arrays = estimator.pose, estimator.pose_covariance, estimator.world_points
+    return [array.tobytes() for array in arrays], in_blocks_count
+
+
+@pytest.mark.parametrize('message_type', TYPES)
+def test_every_format_of_a_drive_comes_in_blocks_and_gives_the_same_estimates(
+    tmp_path, message_type
+):
+    messages = [
+        each
+        for each in recorded(np.random.default_rng(5), message_type, 0)
+        if each[1] != 'tf2_msgs/msg/TFMessage'
+    ]
+    write_mcap(tmp_path / 'run.mcap', messages, chunk_size=10**6)
+    estimates, in_blocks_count = estimated(tmp_path / 'run.mcap')
+    assert in_blocks_count > 150
+    sqlite = write_sqlite(tmp_path / 'sqlite', messages)
+    assert estimated(sqlite) == (estimates, in_blocks_count)
+    assert estimated(write_ros1(tmp_path / 'run.bag', messages)) == (estimates, in_blocks_count)
 
 
 def true_pose(rng, message_type, stamp_ns, frame):
