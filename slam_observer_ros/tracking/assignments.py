@@ -29,7 +29,6 @@ from slam_observer_ros.lie.matrices import (
     transpose,
     with_blocks,
 )
-from slam_observer_ros.tracking.hypothesis import LandmarkIndex
 from slam_observer_ros.tracking.joint_compatibility import (
     columns_of,
     JointSearch,
@@ -45,6 +44,9 @@ from slam_observer_ros.tracking.state import State
 
 MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""
+
+FEW_PAIRS = 200
+"""Pairs of a point and a landmark of which each is judged: of more, only those that are near."""
 
 HARDLY_MOVED = 0.5 * RESOLUTION
 """Shift of the points, in standard deviations of the sensor, up to which a correction hardly moves
@@ -63,7 +65,6 @@ class Assignment:
 
 def find_assignments(
     state: State,
-    index: LandmarkIndex,
     event: ObservationEvent,
     new_costs: NewCosts,
     budget: float,
@@ -71,21 +72,23 @@ def find_assignments(
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different poses, the most likely first.
 
-    ``state`` is at the instant of ``event``, an observation of m points, and ``index`` has
-    its landmarks. Points without an id cost ``new_costs`` if they are of a new landmark. None
-    costs more than ``budget``. Where the state ``is_alone``, costs matter only to each other.
+    ``state`` is at the instant of ``event``, an observation of m points. Points without an id
+    cost ``new_costs`` if they are of a new landmark. None costs more than ``budget``. Where the
+    state ``is_alone``, costs matter only to each other.
     """
     # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
     axes, m = state.axes, len(event.ids)
     seen = _Points(state, event)
-    at, rows = _candidates(state, index, seen)
+    at, rows = _candidates(state, seen)
     residuals = _as_residuals(state.observer, seen, at, rows)
     r, noise = residuals.on(axes)
     # Which points are of a known landmark in any case: nearly always all, and each of one.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
     none_costs = np.where(event.ids == UNKNOWN_ID, new_costs.each, gate_cost)
-    if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at) == m:
+    # Nearly always each point may be of one landmark.
+    are_single = len(set(at.tolist())) == len(set(rows.tolist())) == len(at)
+    if is_alone and are_single and len(at) == m and certain.all():
         evidence = 0.5 * (none_costs[at] - huber_loss(mahalanobis(r, noise)))
         return [Assignment(_taken(m, at, rows, -1), _taken(m, at, evidence, 0.0), 0.0)]
     PC, CPC = state.known_errors.predicted(residuals)
@@ -108,9 +111,8 @@ def find_assignments(
         steps[outside:],
     )
     moves = _PoseMoves(state, seen, PC)
-    # Nearly always each point may be of one landmark, and all together hardly move the robot.
-    are_single = len(np.unique(at)) == len(np.unique(rows)) == len(at) > 0
-    whole = search.all_pairs() if are_single else None
+    # Nearly always they hardly move the robot, all together.
+    whole = search.all_pairs() if are_single and len(at) else None
     is_enough = whole is not None and _largest(moves.by(whole)) <= HARDLY_MOVED
     pairings = [whole] if whole is not None and is_enough else moves.distinct(search.pairings())
     # By how much likelier each pair is than a point of nothing known.
@@ -172,14 +174,16 @@ class _Points:
         self.known_rows = state.landmarks.rows_of(event.ids)
         # (m, 3, c) how they change with the calibration
         self.D = sensitivity(state, event)
-        self.is_new_id = (event.ids != UNKNOWN_ID) & (self.known_rows < 0)
+        has_id = event.ids != UNKNOWN_ID
+        self.some_have_ids, self.is_new_id = bool(has_id.any()), has_id & (self.known_rows < 0)
 
 
-def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
+def _candidates(state: State, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate."""
-    at, rows = _pairs_near(state, index, seen)
-    allowed = _may_be(state, seen, at, rows)
-    at, rows = at[allowed], rows[allowed]
+    at, rows = _pairs_near(state, seen)
+    if seen.some_have_ids:
+        allowed = _may_be(state, seen, at, rows)
+        at, rows = at[allowed], rows[allowed]
     residuals = _as_residuals(state.observer, seen, at, rows)
     distances = state.gains.distances(residuals)
     # Each pair passes the gate alone; a point keeps its nearest landmarks.
@@ -190,8 +194,12 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     return at[near], rows[near]
 
 
-def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
+def _pairs_near(state: State, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
+    m, landmarks = len(seen.points), state.observer.points
+    if m * len(landmarks) <= FEW_PAIRS:
+        everything = np.arange(len(landmarks))
+        return np.repeat(np.arange(m), len(landmarks)), np.tile(everything, m)
     errors = state.known_errors
     of_pose, of_landmarks = errors.pose_covariance(), errors.landmark_covariances()
     C = SPATIAL.output_matrix(seen.points)
@@ -201,7 +209,11 @@ def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
         deviations = np.sqrt(state.gains.calibration_variances)
         spread_m = spread_m + np.linalg.norm(seen.D, axis=1) @ deviations
     reach_m = state.settings.rejection_threshold * spread_m
-    return index.near(state.observer.points, seen.points, reach_m)
+    near = [
+        np.flatnonzero(np.square(landmarks - point).sum(axis=1) <= reach**2)
+        for point, reach in zip(seen.points, reach_m.tolist(), strict=True)
+    ]
+    return np.repeat(np.arange(m), [len(rows) for rows in near]), np.concatenate(near)
 
 
 def _may_be(state: State, seen: _Points, at: IntArray, rows: IntArray) -> BoolArray:

@@ -385,17 +385,17 @@ class Hypotheses:
 
     def _disagreement(self) -> float:
         """Return the pose's deviation by all hypotheses over that by the best one, at most."""
-        of_each: list[tuple[FloatArray, FloatArray | None]] = []
-        for hypothesis in self._all:
-            observer, errors = hypothesis.state.observer, hypothesis.state.known_errors
-            covariance = of_pose(observer, errors.pose_covariance(), observer.A)
-            of_each.append((observer.pose, covariance))
-        own, mixed = of_each[0][1], self._mixed(of_each)
-        if own is None or mixed is None:
-            return 0.0
-        pose, least = self.best.axes.pose, LEAST_DEVIATION**2
-        L = np.linalg.inv(cholesky(own[pose, pose] + least * np.eye(self.best.axes.p)))
-        spread = L @ (mixed[pose, pose] + least * np.eye(self.best.axes.p)) @ L.T
+        states, observer, pose = self.states, self.best.observer, self.best.axes.pose
+        # All at once: they have one reference frame.
+        of_errors = np.array([state.known_errors.pose_covariance() for state in states])
+        A = np.array([state.observer.A for state in states])
+        covariances = of_pose(observer, of_errors, A)[:, pose, pose]
+        poses = observer.reference_pose @ A
+        d = _difference(poses[0], poses)[:, pose]
+        moments = covariances + d[:, :, None] * d[:, None, :]
+        least = LEAST_DEVIATION**2 * np.eye(len(d[0]))
+        L = np.linalg.inv(cholesky(covariances[0] + least))
+        spread = L @ (np.tensordot(self.weights, moments, 1) + least) @ L.T
         return float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
 
     def _judge_standing(self, event: ObservationEvent) -> None:
@@ -482,7 +482,8 @@ class Hypotheses:
                 if uses[number]:
                     hypothesis = hypothesis.copy()
             state = hypothesis.state
-            state.landmarks.renumber(taken.named_rows, taken.given_ids)
+            if len(taken.named_rows):
+                state.landmarks.renumber(taken.named_rows, taken.given_ids)
             rows = state.landmarks.rows_of(taken.event.ids)
             yield (one := Association(state, replace(event, ids=taken.event.ids), rows))
             self._weigh(hypothesis, taken, event)
@@ -530,9 +531,7 @@ class Hypotheses:
         for number, hypothesis in enumerate(self._all):
             cost, state = hypothesis.cost, hypothesis.state
             budget = worst - cost
-            for taken in interpretations(
-                state, hypothesis.index, event, new_ids, new_costs, budget, is_alone
-            ):
+            for taken in interpretations(state, event, new_ids, new_costs, budget, is_alone):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
@@ -602,14 +601,15 @@ def have_one_map(state: State, other: State) -> bool:
     to come will show then which of them is right. Where one of them has a landmark that the other
     has not, that is yet to be confirmed.
     """
-    rows, others = state.landmarks.rows_of(other.landmarks.ids), np.arange(len(other.landmarks))
-    is_common = rows >= 0
-    if not other.landmarks.tentative[~is_common].all():
+    rows = state.landmarks.rows_of(other.landmarks.ids)
+    others = np.flatnonzero(rows >= 0)
+    only_here = np.ones(len(state.landmarks), dtype=np.bool_)
+    only_here[rows[others]] = False
+    if (only_here & ~state.landmarks.tentative).any():
         return False
-    only_here = np.setdiff1d(np.arange(len(state.landmarks)), rows)
-    if not state.landmarks.tentative[only_here].all():
+    if (~other.landmarks.tentative[rows < 0]).any():
         return False
-    rows, others = rows[is_common], others[is_common]
+    rows = rows[others]
     return _agree(state, rows, other, others) and _agree(other, others, state, rows)
 
 

@@ -1,15 +1,13 @@
-"""One of several hypotheses about pose and map: a state, and helpers for points without an id.
+"""One of several hypotheses about pose and map: a state, and its view of points without an id.
 
-For such points there is an index, which finds near landmarks without a search of the whole map,
-and a record of the sensor's view: which landmarks should have been seen, and which were.
+That is a record of what the sensor sees: which landmarks should have been seen, and which were.
 """
 
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 import numpy as np
 
@@ -19,55 +17,6 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.landmark_table import LandmarkTable
 from slam_observer_ros.lie import se3
 from slam_observer_ros.tracking.state import State
-
-MAX_LOOSE = 256
-"""Landmarks newer than the tree that are searched one by one before it is built again."""
-
-
-class LandmarkIndex:
-    """A k-d tree over landmarks that move a little all the time.
-
-    Every correction moves landmarks by less than the search is wide. So the tree is kept while
-    the largest shift since it was built is below that, and the search is widened by the shift.
-    """
-
-    def __init__(self) -> None:
-        self._built: FloatArray = np.empty((0, 3))
-        self._tree: Any = None  # before the first search
-
-    def near(
-        self, landmarks: FloatArray, points: FloatArray, radii_m: FloatArray
-    ) -> tuple[IntArray, IntArray]:
-        """Return pairs (q,), (q,) of a point and a landmark, by point.
-
-        All pairs closer than the point's radius (m,) are among them, and some that aren't.
-        Landmarks (n, 3), as they are now, and points (m, 3) are in one frame, metres.
-        """
-        shift_m = self._refresh(landmarks, np.min(radii_m, initial=np.inf))
-        near = self._tree.query_ball_point(points, radii_m + shift_m, return_sorted=True)
-        loose = np.arange(len(self._built), len(landmarks))
-        rows = [np.append(np.array(point_rows, dtype=np.int64), loose) for point_rows in near]
-        i = np.repeat(np.arange(len(points)), [len(point_rows) for point_rows in rows])
-        return i, np.concatenate([np.empty(0, dtype=np.int64), *rows])
-
-    def _refresh(self, landmarks: FloatArray, tolerance_m: float) -> float:
-        """Build the tree again if it is too old; return the largest shift since it was built."""
-        shift_m = self._shift_m(landmarks)
-        if self._tree is not None and shift_m <= tolerance_m:
-            return shift_m
-        from scipy.spatial import cKDTree  # which only points without ids need
-
-        self._built = landmarks.copy()
-        self._tree = cKDTree(self._built)
-        return 0.0
-
-    def _shift_m(self, landmarks: FloatArray) -> float:
-        built = len(self._built)
-        if built == 0 or not built <= len(landmarks) <= built + MAX_LOOSE:
-            return np.inf
-        shifts = landmarks[:built] - self._built
-        return float(np.sqrt(np.max(np.einsum('ij,ij->i', shifts, shifts))))
-
 
 HULL_MARGIN = 0.01
 """How far outside, as a share of what it measures across, a point may be and still be inside.
@@ -256,11 +205,10 @@ class Branch:
 
 @dataclass(slots=True, eq=False)
 class Hypothesis:
-    """A state, with the helpers for points without an id."""
+    """A state, with its view of points without an id."""
 
     state: State
     visibility: Visibility  # the view of a sensor that gives no ids
-    index: LandmarkIndex = field(default_factory=LandmarkIndex)
     cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
     apart: frozenset[tuple[int, int]] = frozenset()  # ids that are two landmarks in any case
     path: tuple[Branch, ...] = ()  # which way it went where others went another
@@ -272,8 +220,7 @@ class Hypothesis:
 
     def with_state(self, state: State) -> Hypothesis:
         """Return another hypothesis, which has had the same landmarks in view."""
-        visibility, index = self.visibility.copy(), copy(self.index)
-        return replace(self, state=state, visibility=visibility, index=index)
+        return replace(self, state=state, visibility=self.visibility.copy())
 
     def copy(self) -> Hypothesis:
         """Return an independent copy."""

@@ -20,7 +20,6 @@ from slam_observer_ros.tracking.costs import (
     rejection_cost,
     SLIP_COST,
 )
-from slam_observer_ros.tracking.hypothesis import LandmarkIndex
 from slam_observer_ros.tracking.joint_compatibility import NewCosts
 from slam_observer_ros.tracking.matching import (
     calibrated,
@@ -52,7 +51,6 @@ class Interpretation:
 
 def interpretations(
     state: State,
-    index: LandmarkIndex,
     event: ObservationEvent,
     new_ids: IntArray,
     new_costs: NewCosts,
@@ -61,24 +59,25 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    ``state`` is at its instant, ``index`` has its landmarks. Points taken for landmarks not seen
+    ``state`` is at its instant. Points taken for landmarks not seen
     before get ``new_ids`` (m,), at ``new_costs`` for those without an id.
     Interpretations that cost more than ``budget`` need not be returned. Where there is no other
     state, ``is_alone``, costs are compared with each other only.
     """
     event = calibrated(state, event)
-    matched, some_are_unknown = match(state, event), bool((event.ids == UNKNOWN_ID).any())
+    some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     if not some_are_unknown:
+        matched = match(state, event)
         rejected = rejects(state, matched)
         if is_contradiction(rejected):
             return _rejected_or_slipped(state, matched, event, rejected)
     if some_are_unknown or may_name(state, event.ids):
-        found = find_assignments(state, index, event, new_costs, budget, is_alone)
+        found = find_assignments(state, event, new_costs, budget, is_alone)
         possible = [_with_ids(state, event, assignment, new_ids) for assignment in found]
         # In a loaded map a robot that is elsewhere is sought anywhere.
         is_own = bool(is_automatic(state.landmarks.ids).all())
         if is_own and (event.ids == UNKNOWN_ID).all():
-            possible += _slips_without_ids(state, index, event, new_ids, new_costs, found)
+            possible += _slips_without_ids(state, event, new_ids, new_costs, found)
         return possible
     cost = pairing_cost(state, len(event.ids), matched.residuals)
     return [Interpretation(event, cost)]
@@ -129,7 +128,6 @@ def _after_slip(
 
 def _slips_without_ids(
     state: State,
-    index: LandmarkIndex,
     event: ObservationEvent,
     new_ids: IntArray,
     new_costs: NewCosts,
@@ -142,7 +140,7 @@ def _slips_without_ids(
         return []
     slips: dict[bytes, Interpretation] = {}
     for other in astray(state):
-        for assignment in find_assignments(other, index, event, new_costs, np.inf, False)[:1]:
+        for assignment in find_assignments(other, event, new_costs, np.inf, False)[:1]:
             is_new, taken_for = assignment.rows < 0, assignment.rows.tobytes()
             if np.sum(is_new) >= new or taken_for in slips:
                 continue

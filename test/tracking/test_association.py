@@ -26,6 +26,7 @@ from slam_observer_ros.runs.metrics import ConfigurationError
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
+from slam_observer_ros.tracking import assignments
 from slam_observer_ros.tracking.hypotheses import (
     are_one,
     have_one_map,
@@ -48,6 +49,15 @@ def nameless(event):
 
 def without_ids(world):
     return world.with_observations(lambda _, event: nameless(event))
+
+
+def test_where_there_are_many_pairs_those_that_are_near_are_enough(monkeypatch):
+    world = without_ids(gain_worlds.drive(SPATIAL, 20.0, 2, noise=0.5, landmarks=8))
+    each = gain_worlds.estimate(world, SPATIAL)
+    monkeypatch.setattr(assignments, 'FEW_PAIRS', 0)
+    near = gain_worlds.estimate(world, SPATIAL)
+    assert_array_equal(near.landmark_ids, each.landmark_ids)
+    assert_array_equal(near.pose, each.pose)
 
 
 @pytest.mark.parametrize(('settings', 'seed'), [(PLANAR, 0), (PLANAR, 1), (SPATIAL, 2)])

@@ -16,7 +16,6 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.robust import huber_loss
 from slam_observer_ros.tracking.costs import NewLandmarks
-from slam_observer_ros.tracking.hypothesis import LandmarkIndex
 from slam_observer_ros.tracking.interpretations import interpretations
 from slam_observer_ros.tracking.joint_compatibility import (
     columns_of,
@@ -119,27 +118,11 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
             observe(estimator, 0.1 * step, [*points, *far], [1, 2, *[UNKNOWN_ID] * len(far)])
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
-        state, index = estimator._hypotheses.best, LandmarkIndex()
+        state = estimator._hypotheses.best
         new_costs = NewCosts(np.full(3, 20.0), np.zeros(3))
-        (only,) = interpretations(state, index, event, np.arange(3), new_costs, np.inf)
+        (only,) = interpretations(state, event, np.arange(3), new_costs, np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
-
-
-@given(st.integers(0, 10_000), st.integers(1, 300), st.floats(0.01, 20.0))
-def test_the_index_misses_no_landmark_while_they_move_and_change_in_number(seed, first, radius_m):
-    rng = np.random.default_rng(seed)
-    index, landmarks = LandmarkIndex(), rng.uniform(-10.0, 10.0, (first, 3))
-    for _ in range(4):
-        points = rng.uniform(-10.0, 10.0, (3, 3))
-        radii_m = radius_m * rng.uniform(0.5, 1.0, 3)
-        found = np.zeros((3, len(landmarks)), dtype=bool)
-        found[index.near(landmarks, points, radii_m)] = True
-        distances_m = np.linalg.norm(points[:, None] - landmarks, axis=2)
-        assert found[distances_m <= radii_m[:, None]].all()
-        landmarks = landmarks + rng.normal(scale=0.05, size=landmarks.shape)
-        landmarks = np.concatenate([landmarks, rng.uniform(-10.0, 10.0, (rng.integers(9), 3))])
-        landmarks = np.delete(landmarks, rng.integers(len(landmarks)), axis=0)
 
 
 def test_on_new_ground_a_new_landmark_costs_less_and_where_all_is_known_as_much_as_the_gate():
