@@ -7,23 +7,20 @@ T is block-tridiagonal, as each pose is linked to the next one only. The border 
 poses: c unknowns that each depends on, then k for each landmark.
 
 A pose sees few landmarks, but once those before it are eliminated it depends on all that they
-saw. So the poses between every :data:`STRIDE`-th one go first, all such stretches side by side: a
-stretch depends on its two ends, on c and on what was seen along it. The shorter chain that is
-left is eliminated by a banded Cholesky factor, with the whole border; so is the whole chain if
-the border is small.
+saw. So in C the poses between every :data:`STRIDE`-th one go first: a stretch of these depends on
+its two ends, on c and on what was seen along it. The shorter chain that is left is eliminated
+with the whole border; so is the whole chain if the border is small, and in numpy.
 """
 
 from __future__ import annotations
 
-import math
 from types import ModuleType
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky_banded
 from scipy.linalg.blas import dtbsv
 from scipy.linalg.lapack import dtbtrs
-from scipy.sparse import csc_array
 
 from slam_observer_ros.common.process import compiled
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -52,25 +49,11 @@ class Equations(NamedTuple):
     border_gradient: FloatArray  # (b,) h
 
 
-class Elimination(Protocol):
-    """The equations of the border after the chain of poses is eliminated, T = Uᵀ U."""
-
-    corner: FloatArray  # (b, b) D − Bᵀ T⁻¹ B
-    border_gradient: FloatArray  # (b,) h − Bᵀ T⁻¹ g
-    last_root: FloatArray  # (d, d) U⁻¹ of the last pose
-    last_rows: FloatArray  # (d, b) rows of U⁻ᵀ B of the last pose
-
-    def fill_in(self, border: FloatArray) -> FloatArray:
-        """Return the changes (S, d) of the poses from those (b,) of the border."""
-
-
 class ChainFactors:
     """Factors of the normal equations; LinAlgError is raised if these are singular."""
 
     def __init__(self, equations: Equations) -> None:
-        self._chain: Elimination = (
-            _InNumpy(equations) if COMPILED is None else _Compiled(COMPILED, equations)
-        )
+        self._chain = _InNumpy(equations) if COMPILED is None else _Compiled(COMPILED, equations)
         # Symmetric: transposed it is laid out as LAPACK has it.
         self._corner, _ = cho_factor(self._chain.corner.T, lower=True, overwrite_a=True)
 
@@ -94,11 +77,12 @@ class ChainFactors:
 
 
 class _Compiled:
-    """The same by ``_gauss_newton.c``, which uses up the equations' border."""
+    """The same as :class:`_InNumpy` by C, which uses up the equations' border."""
 
     def __init__(self, compiled: ModuleType, equations: Equations) -> None:
         (S, d), b = equations.gradient.shape, len(equations.corner)
-        R = S - (STRIDE - 1) * _stretch_count(equations)
+        stretches = 0 if b <= SMALL_BORDER else (S - 1) // STRIDE
+        R = S - (STRIDE - 1) * stretches  # poses that are left
         factors, rows = np.empty((R, d, d)), np.empty((R, d, b + 1))
         self._compiled = compiled
         self._equations = equations = Equations._make(map(np.ascontiguousarray, equations))
@@ -121,135 +105,44 @@ class _Compiled:
 
 
 class _InNumpy:
-    """The same in numpy, the reference."""
+    """The equations of the border after the chain of poses is eliminated, T = Uᵀ U.
 
-    def __init__(self, equations: Equations) -> None:
-        self._stretches = _Stretches(equations)
-        diagonal, above, rows = self._stretches.kept_chain(equations)
-        corner, border_gradient = self._stretches.border(equations)
-        self._d = d = rows.shape[2]
-        self._factor = np.asfortranarray(cholesky_banded(_banded(diagonal, above)))
-        rows = _forward(self._factor, rows.reshape(len(rows), -1))
-        self._border, self._gradient = rows[:-1], rows[-1]
-        self.corner = corner - self._border @ self._border.T
-        self.border_gradient = border_gradient - self._border @ self._gradient
-        self.last_root = _forward(self._factor[:, -d:], np.eye(d))
-        self.last_rows = self._border[:, -d:].T
-
-    def fill_in(self, border: FloatArray) -> FloatArray:
-        """Return the changes (S, d) of the poses from those (b,) of the border."""
-        bandwidth = len(self._factor) - 1
-        kept = -dtbsv(bandwidth, self._factor, self._gradient + border @ self._border)
-        return self._stretches.fill_in(kept.reshape(-1, self._d), border)
-
-
-class _Stretches:
-    """The J stretches of poses between every :data:`STRIDE`-th one, eliminated.
-
-    A stretch depends on its start, its end and a part of the border: ``_columns`` (J, c + k m),
-    filled up with columns behind the border's last where it saw less than m landmarks.
+    This is the reference: a banded Cholesky factor carries the whole border along.
     """
 
     def __init__(self, equations: Equations) -> None:
         S, self._d = equations.gradient.shape
-        self._count = _stretch_count(equations)
-        self._inner = STRIDE * np.arange(self._count)[:, None] + np.arange(1, STRIDE)
-        self._kept = np.setdiff1d(np.arange(S), self._inner)
-        stretch, offset = np.divmod(equations.poses, STRIDE)
-        self._is_inner = (stretch < self._count) & (offset > 0)
-        T, X = self._matrices(equations), self._links(equations)
-        self._solved = np.linalg.solve(T, X)
-        self._lost = transpose(X) @ self._solved
-
-    def _matrices(self, equations: Equations) -> FloatArray:
-        """Return the part of T (J, (STRIDE − 1) d, (STRIDE − 1) d) of each stretch."""
-        J, d, row = self._count, self._d, np.arange(STRIDE - 1)
-        T = np.zeros((J, STRIDE - 1, d, STRIDE - 1, d))
-        above = equations.above[self._inner[:, :-1]].swapaxes(0, 1)
-        T[:, row, :, row] = equations.diagonal[self._inner].swapaxes(0, 1)
-        T[:, row[:-1], :, row[1:]] = above
-        T[:, row[1:], :, row[:-1]] = transpose(above)
-        return T.reshape(J, (STRIDE - 1) * d, (STRIDE - 1) * d)
-
-    def _links(self, equations: Equations) -> FloatArray:
-        """Return (J, (STRIDE − 1) d, …): links to start, end and columns; then the gradient."""
-        J, d, (k, c) = self._count, self._d, (equations.seen.shape[2], equations.shared.shape[2])
-        # Which landmarks each stretch saw, and the columns they have in it.
-        stretch, offset = np.divmod(equations.poses[self._is_inner], STRIDE)
-        beyond = (len(equations.corner) - c) // k
-        local, slots = _group(stretch, equations.landmarks[self._is_inner], J, beyond)
-        own = landmark_columns(local, c, k).reshape(J, k * local.shape[1])
-        self._columns = np.hstack([np.tile(np.arange(c), (J, 1)), own])
-        seen = np.zeros((J, STRIDE - 1, d, local.shape[1], k))
-        seen[stretch, offset - 1, :, slots] = equations.seen[self._is_inner]
-        # The links of its first pose to the start, of its last to the end.
-        to_start, to_end = np.zeros((2, J, STRIDE - 1, d, d))
-        to_start[:, 0] = transpose(equations.above[self._inner[:, 0] - 1])
-        to_end[:, -1] = equations.above[self._inner[:, -1]]
-        shared, gradient = equations.shared[self._inner], equations.gradient[self._inner]
-        own_links = seen.reshape(J, STRIDE - 1, d, own.shape[1])
-        X = np.concatenate([to_start, to_end, shared, own_links, gradient[..., None]], axis=-1)
-        return X.reshape(J, (STRIDE - 1) * d, X.shape[-1])
-
-    def kept_chain(self, equations: Equations) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return blocks (R, d, d) and (R − 1, d, d) of the R poses left, and rows (b + 1, R, d).
-
-        The rows are their links to the border, and last their gradient.
-        """
-        J, d, start, end = self._count, self._d, slice(self._d), slice(self._d, 2 * self._d)
-        diagonal, gradient = equations.diagonal[self._kept], equations.gradient[self._kept]
-        # Less what the stretches from each pose and to it have taken along.
-        diagonal[:J] -= self._lost[:, start, start]
-        diagonal[1 : J + 1] -= self._lost[:, end, end]
-        gradient[:J] -= self._lost[:, start, -1]
-        gradient[1 : J + 1] -= self._lost[:, end, -1]
-        above = np.concatenate([-self._lost[:, start, end], equations.above[STRIDE * J :]])
-        rows, stretch = self._kept_links(equations), np.arange(J)[:, None]
-        rows[self._columns, stretch] -= transpose(self._lost[:, start, 2 * d : -1])
-        rows[self._columns, stretch + 1] -= transpose(self._lost[:, end, 2 * d : -1])
-        b = len(equations.corner)
-        rows[b] = gradient
-        return diagonal, above, rows[: b + 1]
-
-    def _kept_links(self, equations: Equations) -> FloatArray:
-        """Return the links (b + k, R, d) of the poses that are left to the border and beyond."""
-        b, k, c = len(equations.corner), equations.seen.shape[2], equations.shared.shape[2]
-        is_kept = ~self._is_inner
-        columns = landmark_columns(equations.landmarks[is_kept], c, k)
-        positions = np.searchsorted(self._kept, equations.poses[is_kept])
-        rows = np.zeros((b + k, len(self._kept), self._d))
-        rows[columns, positions[:, None]] = transpose(equations.seen[is_kept])
-        rows[:c] += equations.shared[self._kept].transpose(2, 0, 1)
+        d, b = self._d, len(equations.corner)
+        k, c = equations.seen.shape[2], equations.shared.shape[2]
+        # Bᵀ (b, S, d), and below it the gradient
+        rows = np.zeros((b + 1, S, d))
+        columns = landmark_columns(equations.landmarks, c, k)
+        rows[columns, equations.poses[:, None]] = transpose(equations.seen)
+        rows[:c] += equations.shared.transpose(2, 0, 1)
         rows[:b, 0] += equations.first.T
-        return rows
+        rows[b] = equations.gradient
+        # T in its upper banded form
+        band = np.zeros((2 * d, S, d))
+        for row in range(d):
+            for column in range(row, d):
+                band[2 * d - 1 + row - column, :, column] = equations.diagonal[:, row, column]
+            for column in range(d):
+                band[d - 1 + row - column, 1:, column] = equations.above[:, row, column]
+        self._factor = np.asfortranarray(cholesky_banded(band.reshape(2 * d, S * d)))
+        solved = _forward(self._factor, rows.reshape(b + 1, S * d))
+        self._border, self._gradient = solved[:b], solved[b]
+        self.corner = equations.corner - self._border @ self._border.T  # (b, b) D − Bᵀ T⁻¹ B
+        # (b,) h − Bᵀ T⁻¹ g
+        self.border_gradient = equations.border_gradient - self._border @ self._gradient
+        self.last_root = _forward(self._factor[:, -d:], np.eye(d))  # (d, d) U⁻¹ of the last pose
+        self.last_rows = self._border[:, -d:].T  # (d, b) rows of U⁻ᵀ B of the last pose
 
-    def border(self, equations: Equations) -> tuple[FloatArray, FloatArray]:
-        """Return D (b, b) and its gradient (b,) after the elimination."""
-        b, columns = len(equations.corner), self._columns
-        size, own = b + equations.seen.shape[2], slice(2 * self._d, -1)
-        entries = size * columns[:, :, None] + columns[:, None]
-        corner = sum_by(entries.ravel(), size**2, self._lost[:, own, own].ravel())
-        gradient = sum_by(columns.ravel(), size, self._lost[:, own, -1].ravel())
-        return (
-            equations.corner - corner.reshape(size, size)[:b, :b],
-            equations.border_gradient - gradient[:b],
-        )
-
-    def fill_in(self, kept: FloatArray, border: FloatArray) -> FloatArray:
-        """Return the changes (S, d) of all poses from those (R, d) left and (b,) of the border."""
-        J, d = self._count, self._d
-        beyond = np.append(border, np.zeros(self._columns.max(initial=0)))
-        ends = np.hstack([kept[:J], kept[1 : J + 1], beyond[self._columns], np.ones((J, 1))])
-        changes = np.empty((len(self._kept) + self._inner.size, d))
-        changes[self._kept] = kept
-        changes[self._inner] = -(self._solved @ ends[:, :, None]).reshape(J, STRIDE - 1, d)
-        return changes
-
-
-def _stretch_count(equations: Equations) -> int:
-    """Return how many stretches of poses are eliminated before the others."""
-    is_small = len(equations.corner) <= SMALL_BORDER
-    return 0 if is_small else (len(equations.gradient) - 1) // STRIDE
+    def fill_in(self, border: FloatArray) -> FloatArray:
+        """Return the changes (S, d) of the poses from those (b,) of the border."""
+        bandwidth = len(self._factor) - 1
+        right = self._gradient + border @ self._border
+        changes: FloatArray = -dtbsv(bandwidth, self._factor, right)
+        return changes.reshape(-1, self._d)
 
 
 def landmark_columns(landmarks: IntArray, c: int, k: int) -> IntArray:
@@ -257,43 +150,8 @@ def landmark_columns(landmarks: IntArray, c: int, k: int) -> IntArray:
     return c + k * landmarks[..., None] + np.arange(k)
 
 
-def sum_by(labels: IntArray, count: int, values: FloatArray) -> FloatArray:
-    """Return the sum of the ``values`` (M, …) of each label (count, …)."""
-    M = len(labels)
-    selection = csc_array((np.ones(M), labels, np.arange(M + 1)), (count, M))
-    sums: FloatArray = selection @ values.reshape(M, math.prod(values.shape[1:]))
-    return sums.reshape(count, *values.shape[1:])
-
-
-def _group(
-    stretch: IntArray, landmarks: IntArray, count: int, beyond: int
-) -> tuple[IntArray, IntArray]:
-    """Give the landmarks that each of ``count`` stretches saw numbers of its own.
-
-    Return which they are (count, m), filled up with ``beyond``, and the number of each (M,).
-    """
-    pairs, inverse = np.unique(stretch * (beyond + 1) + landmarks, return_inverse=True)
-    of_stretch, landmark = np.divmod(pairs, beyond + 1)
-    number = np.arange(len(pairs)) - np.searchsorted(of_stretch, of_stretch)
-    local = np.full((count, number.max(initial=-1) + 1), beyond)
-    local[of_stretch, number] = landmark
-    return local, number[inverse]
-
-
 def _forward(chain: FloatArray, rows: FloatArray) -> FloatArray:
     """Return U⁻ᵀ b for each row b: half of solving by T = Uᵀ U, and all that is needed."""
     # There must be a row: of none, SciPy 1.17 writes beyond the end.
     solved: FloatArray = dtbtrs(chain, rows.T, trans='T')[0].T
     return solved
-
-
-def _banded(diagonal: FloatArray, above: FloatArray) -> FloatArray:
-    """Return the upper banded form (2 d, S d) of a block-tridiagonal matrix."""
-    S, d = diagonal.shape[:2]
-    band = np.zeros((2 * d, S, d))
-    for row in range(d):
-        for column in range(row, d):
-            band[2 * d - 1 + row - column, :, column] = diagonal[:, row, column]
-        for column in range(d):
-            band[d - 1 + row - column, 1:, column] = above[:, row, column]
-    return band.reshape(2 * d, S * d)

@@ -20,8 +20,9 @@ import math
 from types import ModuleType
 
 import numpy as np
+from scipy.sparse import csc_array
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import POINT
 from slam_observer_ros.filter.arrays import UNKNOWN_RAD
 from slam_observer_ros.lie import se3, so3
@@ -33,7 +34,6 @@ from slam_observer_ros.smoothing.bordered_chain import (
     COMPILED,
     Equations,
     landmark_columns,
-    sum_by,
 )
 from slam_observer_ros.smoothing.keyframes import inverse, Keyframes, Solution
 from slam_observer_ros.smoothing.observations import (
@@ -51,11 +51,7 @@ class Step:
 
     start: Solution  # where all was linearised
     end: Solution
-    factors: ChainFactors  # of the equations at ``start``
-
-    def marginal(self) -> FloatArray:
-        """Return the covariance of (η, dc, dp) at ``start``, η and dc being the last ones."""
-        return self.factors.marginal()
+    factors: ChainFactors  # of the equations at ``start``, so its marginal is of (η, dc, dp) there
 
 
 MOST_HALVED = 8  # times at most that a step is halved
@@ -87,7 +83,12 @@ class Smoother:
         self._unknowns = axes.point + axes.turn  # of a landmark: its position, then its turn
         drifts, c = settings.calibration_drift > 0.0, len(prior.calibration)
         self._chained, self._shared = (c, 0) if drifts else (0, c)
-        self._link_information = _link_information(keyframes, drifts)
+        self._link_information = inverse(keyframes.links.covariances)
+        if drifts:
+            d, of_motions = axes.p, self._link_information
+            self._link_information = np.zeros((len(of_motions), d + c, d + c))
+            self._link_information[:, :d, :d] = of_motions
+            self._link_information[:, d:, d:] = inverse(keyframes.drift_covariances)
         self._prior_information = inverse(prior.covariance)
         self._is_usual = not axes.turn and not drifts
         self._as_given = self._observations
@@ -196,52 +197,46 @@ class Smoother:
     def _linearise(self, solution: Solution, gated: bool = True) -> Equations:
         if COMPILED is not None and self._is_usual:
             return self._linearised_by(COMPILED, solution, gated)
-        c, k, keyframes = self._shared, self._unknowns, self._keyframes
-        S, b = len(solution.poses), c + k * len(solution.points)
-        d = self._axes.p + self._chained
+        equations, n = self._no_equations(solution), len(solution.points)
+        k, (S, d) = self._unknowns, equations.gradient.shape
         # What the observations say of poses, landmarks, and of both together.
         H, gradient = self._observations.normal_equations(solution, self._chained, gated)
-        poses, landmarks, n = keyframes.keyframes + 1, keyframes.landmarks, len(solution.points)
-        columns = landmark_columns(np.arange(n), c, k)
-        corner, border_gradient = np.zeros((b, b)), np.zeros(b)
+        poses, landmarks = equations.poses, equations.landmarks
+        columns = landmark_columns(np.arange(n), self._shared, k)
         end = d + k  # beyond are sensors
-        corner[columns[:, :, None], columns[:, None]] = sum_by(landmarks, n, H[:, d:end, d:end])
-        border_gradient[columns] = sum_by(landmarks, n, gradient[:, d:end])
-        equations = Equations(
-            diagonal=sum_by(poses, S, H[:, :d, :d]),
-            above=np.zeros((S - 1, d, d)),
-            shared=np.zeros((S, d, c)),
-            poses=poses,
-            landmarks=landmarks,
-            seen=H[:, :d, d:end],
-            first=np.zeros((d, b)),
-            corner=corner,
-            gradient=sum_by(poses, S, gradient[:, :d]),
-            border_gradient=border_gradient,
-        )
+        of_landmarks = _sum_by(landmarks, n, H[:, d:end, d:end])
+        equations.corner[columns[:, :, None], columns[:, None]] = of_landmarks
+        equations.border_gradient[columns] = _sum_by(landmarks, n, gradient[:, d:end])
+        equations.diagonal[:] = _sum_by(poses, S, H[:, :d, :d])
+        equations.gradient[:] = _sum_by(poses, S, gradient[:, :d])
+        equations.seen[:] = H[:, :d, d:end]
         if H.shape[1] > end:
             self._add_sensors(equations, H[:, end:], gradient[:, end:])
         self._add_prior(equations, solution)
         self._add_motions(equations, solution)
         return equations
 
-    def _linearised_by(self, compiled: ModuleType, solution: Solution, gated: bool) -> Equations:
-        """Return the same by ``_gauss_newton.c``."""
-        c, k, d, keyframes = self._shared, self._unknowns, self._axes.p, self._keyframes
-        prior, links, settings = self._prior, keyframes.links, self._settings
-        S, M, b = len(solution.poses), len(keyframes.landmarks), c + k * len(solution.points)
-        equations = Equations(
+    def _no_equations(self, solution: Solution) -> Equations:
+        """Return equations of the right sizes that say nothing yet."""
+        c, k, keyframes = self._shared, self._unknowns, self._keyframes
+        d, S, b = self._axes.p + self._chained, len(solution.poses), c + k * len(solution.points)
+        return Equations(
             diagonal=np.zeros((S, d, d)),
             above=np.zeros((S - 1, d, d)),
             shared=np.zeros((S, d, c)),
             poses=keyframes.keyframes + 1,
             landmarks=keyframes.landmarks,
-            seen=np.zeros((M, d, k)),
+            seen=np.zeros((len(keyframes.landmarks), d, k)),
             first=np.zeros((d, b)),
             corner=np.zeros((b, b)),
             gradient=np.zeros((S, d)),
             border_gradient=np.zeros(b),
         )
+
+    def _linearised_by(self, compiled: ModuleType, solution: Solution, gated: bool) -> Equations:
+        """Return the same by ``_gauss_newton.c``."""
+        equations, keyframes = self._no_equations(solution), self._keyframes
+        prior, links, settings = self._prior, keyframes.links, self._settings
         information, calibration = self._prior_information, solution.calibrations[0]
         sensed = NO_SENSORS if self._sensed is None else self._sensed.flat(calibration)
         gate = settings.rejection_threshold if gated else 0.0
@@ -251,9 +246,15 @@ class Smoother:
             (links.motions, links.sensitivities, self._link_information, keyframes.calibrations),
             (keyframes.points, keyframes.information, keyframes.shares, *sensed),
             (solution.poses, calibration, solution.points),
-            (gate, settings.huber_threshold, d == PLANAR.p),
+            (gate, settings.huber_threshold, self._axes.p == PLANAR.p),
         )
-        compiled.linearise(*(tuple(map(_contiguous, part)) for part in parts))
+        # An array may be a view of another one.
+        compiled.linearise(
+            *(
+                tuple(np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x for x in part)
+                for part in parts
+            )
+        )
         return equations
 
     def _add_sensors(self, equations: Equations, H: FloatArray, gradient: FloatArray) -> None:
@@ -261,9 +262,9 @@ class Smoother:
         c, k, (S, d) = self._shared, self._unknowns, equations.gradient.shape
         n = (len(equations.corner) - c) // k
         sensors, columns = slice(c - H.shape[1], c), landmark_columns(np.arange(n), c, k).ravel()
-        of_landmarks = sum_by(equations.landmarks, n, transpose(H[:, :, d : d + k]))
+        of_landmarks = _sum_by(equations.landmarks, n, transpose(H[:, :, d : d + k]))
         of_landmarks = of_landmarks.reshape(-1, H.shape[1])
-        equations.shared[:, :, sensors] += sum_by(equations.poses, S, transpose(H[:, :, :d]))
+        equations.shared[:, :, sensors] += _sum_by(equations.poses, S, transpose(H[:, :, :d]))
         equations.corner[columns, sensors] += of_landmarks
         equations.corner[sensors, columns] += of_landmarks.T
         equations.corner[sensors, sensors] += np.sum(H[:, :, d + k :], axis=0)
@@ -329,16 +330,12 @@ class Smoother:
             F = J_off @ F
         if not self._chained:
             return np.concatenate([J_from, J_to, F], axis=2), error[:, pose]
-        drift = np.diff(solution.calibrations, axis=0)
-        return self._chained_links(J_from, J_to, F), np.hstack([error[:, pose], drift])
-
-    def _chained_links(self, J_from: FloatArray, J_to: FloatArray, F: FloatArray) -> FloatArray:
-        """Return (S, d + c, 2 d + 2 c), the derivatives by both poses and their calibrations."""
-        d, c = F.shape[1:]
+        # (S, d + c, 2 d + 2 c), by both poses and their calibrations
+        drift, (d, c) = np.diff(solution.calibrations, axis=0), F.shape[1:]
         J = np.zeros((len(F), d + c, 2 * (d + c)))
         J[:, :d, :d], J[:, :d, d : d + c], J[:, :d, d + c : -c] = J_from, F, J_to
         J[:, d:, d : d + c], J[:, d:, -c:] = -np.eye(c), np.eye(c)
-        return J
+        return J, np.hstack([error[:, pose], drift])
 
     def _estimated(self, matrices: FloatArray) -> FloatArray:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""
@@ -346,18 +343,9 @@ class Smoother:
         return matrices[:, pose, pose]
 
 
-def _contiguous(part: object) -> object:
-    """Return what C reads: an array may be a view of another one."""
-    return np.ascontiguousarray(part) if isinstance(part, np.ndarray) else part
-
-
-def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:
-    """Return the information (S, d, d) of motions, or (S, d + c, d + c) with a drift's."""
-    of_motions = inverse(keyframes.links.covariances)
-    if not drifts:
-        return of_motions
-    d, c = keyframes.links.sensitivities.shape[1:]
-    information = np.zeros((len(of_motions), d + c, d + c))
-    information[:, :d, :d] = of_motions
-    information[:, d:, d:] = inverse(keyframes.drift_covariances)
-    return information
+def _sum_by(labels: IntArray, count: int, values: FloatArray) -> FloatArray:
+    """Return the sum of the ``values`` (M, …) of each label (count, …)."""
+    M = len(labels)
+    selection = csc_array((np.ones(M), labels, np.arange(M + 1)), (count, M))
+    sums: FloatArray = selection @ values.reshape(M, math.prod(values.shape[1:]))
+    return sums.reshape(count, *values.shape[1:])

@@ -64,30 +64,6 @@ class Keyframe(NamedTuple):
         )
 
 
-def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:
-    """Return how the tags among a keyframe's m points are turned."""
-    seen = keyframe.orientations
-    if seen is None:
-        return no_turns(axes.turn)
-    information = np.linalg.inv(axes.turn_covariances(seen.covariances)).astype(np.float64)
-    every = SeenTurns(np.arange(len(seen.rows)), seen.Z, seen.flipped, information)
-    return every.without(np.logical_not(seen.Z.any(axis=(1, 2))))
-
-
-def _kinds(keyframe: Keyframe) -> IntArray:
-    return np.full(len(keyframe.rows), POINT) if keyframe.kinds is None else keyframe.kinds
-
-
-def _origins(keyframe: Keyframe) -> FloatArray:
-    return np.zeros_like(keyframe.points) if keyframe.origins is None else keyframe.origins
-
-
-def _all_sensed(seen: list[Keyframe]) -> Sensed | None:
-    """Return what sensors showed in keyframes, if any of them is calibrated."""
-    sensed = [part.sensed for part in seen if part.sensed is not None]
-    return joined_sensed(sensed) if sensed else None
-
-
 class _Link(NamedTuple):
     """The motion that led to a keyframe: the sum of those given to History.move."""
 
@@ -99,14 +75,6 @@ class _Link(NamedTuple):
     calibration: FloatArray
     # The pose (4, 4) after it, and noise (p, p), if the robot was taken for slipped
     slip: tuple[FloatArray, FloatArray] | None
-
-    @property
-    def with_slip(self) -> list[_Link]:
-        """The same with the slip as a part of the motion; none if there was none."""
-        if self.slip is None:
-            return []
-        end, noise = self.slip
-        return [self._replace(end=end, noise=self.noise + noise)]
 
 
 class History:
@@ -158,16 +126,13 @@ class History:
         """
         if self._start is None:
             self._start = start.copy()
-        self._end, before = motion.A, self._motion
-        if before is None:
-            self._motion = motion.noise, motion.sensitivity, drift
+        self._end = motion.A
+        more = motion.noise, motion.sensitivity, drift
+        if self._motion is None:
+            self._motion = more
         else:
-            noise, sensitivity, drift_before = before
-            self._motion = (
-                noise + motion.noise,
-                sensitivity + motion.sensitivity,
-                drift_before + drift,
-            )
+            noise, sensitivity, drift_before = self._motion
+            self._motion = noise + more[0], sensitivity + more[1], drift_before + drift
         self._calibration = calibration.values
 
     def slip(self, start: FloatArray, motion: Advanced) -> None:
@@ -190,8 +155,7 @@ class History:
     def mark(self, mark: int, stamp_ns: int, pose: FloatArray, calibration: FloatArray) -> None:
         """Append a keyframe in which landmarks were seen that may be known later."""
         self._marked.append((mark, len(self.stamps_ns)))
-        nothing = np.empty((0, 3))
-        none = np.empty(0, dtype=np.int64)
+        none, nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
         keyframe = Keyframe(stamp_ns, none, nothing, nothing, None, np.empty(0))
         self.add(keyframe, pose, calibration)
 
@@ -335,12 +299,29 @@ class History:
     def _as_arrays(self, seen: list[Keyframe], links: list[_Link], first: int) -> Keyframes:
         """Return keyframes as arrays; ``first`` is the number of the first one."""
         slips = [number for number, link in enumerate(links, first) if link.slip is not None]
+        slipped = [
+            link._replace(end=link.slip[0], noise=link.noise + link.slip[1])
+            for link in links
+            if link.slip is not None
+        ]
         k, c = self._axes.point, len(self._calibration)
         numbers = np.arange(first, first + len(seen))
+        kinds, origins, turns = [], [], []
+        for part in seen:
+            kinds.append(np.full(len(part.rows), POINT) if part.kinds is None else part.kinds)
+            origins.append(np.zeros_like(part.points) if part.origins is None else part.origins)
+            tags = no_turns(self._axes.turn)
+            if (found := part.orientations) is not None:
+                covariances = self._axes.turn_covariances(found.covariances)
+                information = np.linalg.inv(covariances).astype(np.float64)
+                tags = SeenTurns(np.arange(len(found.rows)), found.Z, found.flipped, information)
+                tags = tags.without(np.logical_not(found.Z.any(axis=(1, 2))))
+            turns.append(tags)
+        sensed = [part.sensed for part in seen if part.sensed is not None]
         return Keyframes(
             links=self._in_frames_of_ends(links),
             slips=np.array(slips, dtype=np.int64),
-            slipped=self._in_frames_of_ends([each for link in links for each in link.with_slip]),
+            slipped=self._in_frames_of_ends(slipped),
             calibrations=np.array([link.calibration for link in links]).reshape(len(links), c),
             drift_covariances=np.array([link.drift for link in links]).reshape(len(links), c, c),
             keyframes=np.repeat(numbers, [len(part.rows) for part in seen]),
@@ -348,10 +329,10 @@ class History:
             points=np.concatenate([part.points for part in seen]),
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
             shares=1.0 / np.concatenate([part.repeated for part in seen]),
-            kinds=np.concatenate([_kinds(part) for part in seen]),
-            origins=np.concatenate([_origins(part) for part in seen]),
-            turns=self._turns(seen),
-            sensed=_all_sensed(seen),
+            kinds=np.concatenate(kinds),
+            origins=np.concatenate(origins),
+            turns=joined_turns(turns, [len(part.rows) for part in seen]),
+            sensed=joined_sensed(sensed) if sensed else None,
         )
 
     def _in_frames_of_ends(self, links: list[_Link]) -> Links:
@@ -367,24 +348,17 @@ class History:
             sensitivities=to_body @ np.array([link.sensitivity for link in links]),
         )
 
-    def _turns(self, seen: list[Keyframe]) -> SeenTurns:
-        """Return how the tags among all points are turned."""
-        turns = [_seen_turns(part, self._axes) for part in seen]
-        return joined_turns(turns, [len(part.rows) for part in seen])
-
     def _covariances(self, seen: list[Keyframe]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""
         stated = [part.covariances for part in seen if part.covariances is not None]
         if len(stated) == len(seen):
             return np.concatenate(stated)
-        covariances = self._observation_noise.at(
-            np.concatenate([part.lines_of_sight for part in seen])
-        )
+        lines_of_sight = np.concatenate([part.lines_of_sight for part in seen])
+        covariances = self._observation_noise.at(lines_of_sight)
         if stated:
-            is_stated = [part.covariances is not None for part in seen]
-            covariances[np.repeat(is_stated, [len(part.rows) for part in seen])] = np.concatenate(
-                stated
-            )
+            counts = [len(part.rows) for part in seen]
+            are_stated = np.repeat([part.covariances is not None for part in seen], counts)
+            covariances[are_stated] = np.concatenate(stated)
         return covariances
 
     def _at_rest(self) -> _Motion:

@@ -59,9 +59,9 @@ class Links:
         """Return the links with others (r,) in place of those at ``rows`` (r,)."""
         if not len(rows):
             return self
-        changed = Links(*(getattr(self, field.name).copy() for field in fields(Links)))
-        for field in fields(Links):
-            getattr(changed, field.name)[rows] = getattr(others, field.name)
+        changed = Links(self.motions.copy(), self.covariances.copy(), self.sensitivities.copy())
+        changed.motions[rows], changed.covariances[rows] = others.motions, others.covariances
+        changed.sensitivities[rows] = others.sensitivities
         return changed
 
     def with_calibration(self, more: int) -> Links:
@@ -221,23 +221,18 @@ def confirmed_slips(
     """
     are_slips = np.zeros(len(keyframes.slips), dtype=np.bool_)
     solution = start
+    stated = inverse(keyframes.links.covariances[keyframes.slips])
+    slipped = inverse(keyframes.slipped.covariances)
+    price = np.linalg.slogdet(stated)[1] - np.linalg.slogdet(slipped)[1]
     for _ in range(ROUNDS):
         solution = solve(keyframes.with_slips(are_slips), solution)
-        as_stated = motion_errors(keyframes, solution)
-        pay = _pay(keyframes, as_stated[keyframes.slips])
+        errors = motion_errors(keyframes, solution)[keyframes.slips]
+        paid = np.einsum('si,sij,sj->s', errors, stated - slipped, errors)
+        pay = np.asarray(paid > price)
         if np.array_equal(pay, are_slips):
             break
         are_slips = pay
     return are_slips, solution
-
-
-def _pay(keyframes: Keyframes, errors: FloatArray) -> BoolArray:
-    """Return which slips (s,) make the errors (s, d) of their motions likelier."""
-    stated = inverse(keyframes.links.covariances[keyframes.slips])
-    slipped = inverse(keyframes.slipped.covariances)
-    paid = np.einsum('si,sij,sj->s', errors, stated - slipped, errors)
-    price = np.linalg.slogdet(stated)[1] - np.linalg.slogdet(slipped)[1]
-    return np.asarray(paid > price)
 
 
 def inverse(covariances: FloatArray) -> FloatArray:

@@ -191,7 +191,7 @@ class Relinearisation(Past):
         self._axes = errors.joint.chart.axes
         self._observer, self._calibration = errors.observer, calibration
         self._observation_noise = ObservationNoise(settings)
-        self._warning = _Warning()
+        self._warned = list[str]()  # by any of its copies, as hypotheses are
         self._seen = self._observations = 0
         self._turn_squared = self._largest_turn = 0.0
         self.reset('the last start')
@@ -306,12 +306,16 @@ class Relinearisation(Past):
         try:
             smoother = self._smoother(history.summary, keyframes)
             step, cost = smoother.descend(solution, PLACING_ITERATIONS, COST_TOLERANCE)
-            covariance = step.marginal()
+            covariance = step.factors.marginal()
         except np.linalg.LinAlgError:
             return None
-        found = step.end.points[row]
-        if not _is_ahead(found, step.end.poses[marked[0] - first + 1], seen[0]):
-            return None  # another minimum
+        # Directions lead there from the poses then, unless this is another minimum.
+        found, own = step.end.points[row], seen[0]
+        back = se3.inverse(step.end.poses[marked[0] - first + 1])
+        lines = back[:, :3, :3] @ found + back[:, :3, 3] - (own.points - own.lines_of_sight)
+        ahead = np.einsum('mi,mi->m', lines, own.lines_of_sight)
+        if (MEASURED[own.kinds][:, 1] & (ahead < 0.0)).any():
+            return None
         (d, k), c = (self._axes.p, self._axes.point), self._calibration.count
         pose = step.end.poses[-1]
         y = se3.transform(se3.inverse(pose), found[None])
@@ -377,7 +381,14 @@ class Relinearisation(Past):
 
         Its estimates are iterated from the present ones, which stay as they are.
         """
-        self._check_smoothable()
+        if self._settings.relinearization_interval == 0:
+            raise ParameterError(NO_HISTORY)
+        if self._observer.have_moved:
+            raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
+        if self._is_given_up:
+            raise ParameterError(
+                f'nothing can be smoothed in so large a map since {self.history.since}'
+            )
         try:
             return *self._smoothed(), self.history
         except np.linalg.LinAlgError as error:
@@ -404,16 +415,6 @@ class Relinearisation(Past):
         start = self._without_outliers_of_then(smoother, start)
         return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE), slips
 
-    def _check_smoothable(self) -> None:
-        if self._settings.relinearization_interval == 0:
-            raise ParameterError(NO_HISTORY)
-        if self._observer.have_moved:
-            raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
-        if self._is_given_up:
-            raise ParameterError(
-                f'nothing can be smoothed in so large a map since {self.history.since}'
-            )
-
     @property
     def _joint(self) -> JointCovariance:
         return self._errors.joint  # which may become one for large maps
@@ -438,13 +439,6 @@ class Relinearisation(Past):
         return 0 < self._settings.smoothing_window <= len(self.history.stamps_ns)
 
     @property
-    def _is_awaited(self) -> bool:
-        """Whether landmarks may enter that were seen since the summary."""
-        history = self.history
-        is_short = len(history.stamps_ns) - history.summarised < MOST_AWAITED
-        return is_short and history.last_mark >= history.summarised
-
-    @property
     def _is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
         if self._is_overdue:  # a landmark that may have moved kept it from being summed up
@@ -464,10 +458,14 @@ class Relinearisation(Past):
         if not (is_done or self._window_is_full):
             return
         known, angle_rad = self._known().least_nonlinear(self._axes)
+        history = self.history
+        is_short = len(history.stamps_ns) - history.summarised < MOST_AWAITED
+        # Whether landmarks may enter that were seen since the summary
+        is_awaited = is_short and history.last_mark >= history.summarised
         if self._window_is_full:
             self._start(known, CUT)
-        elif is_done and angle_rad < MAX_TURN_RAD and not self._is_awaited:
-            self.history.summarise(known)
+        elif is_done and angle_rad < MAX_TURN_RAD and not is_awaited:
+            history.summarise(known)
 
     def _relinearise(self, iterations: int = ITERATIONS) -> bool:
         """Relinearise the keyframes that are not summarised at the present estimates, if possible.
@@ -482,9 +480,11 @@ class Relinearisation(Past):
             smoother = self._smoother(history.summary, history.latest_keyframes())
             start = self._without_outliers_of_then(smoother, self._solution_from(first))
             step = smoother.smooth(start, iterations, TOLERANCE)
-            covariance = step.marginal()
+            covariance = step.factors.marginal()
         except np.linalg.LinAlgError:
-            self._warning.give()
+            if not self._warned:
+                self._warned.append('not_relinearised')
+                logger.warning('%s', found('not_relinearised'))
             return False
         # … and let filter and history go on from the result.
         history.poses[first:] = list(step.end.poses)
@@ -545,14 +545,6 @@ class Relinearisation(Past):
         return Prior(observer.A.copy(), values, points, orientations, P)
 
 
-def _is_ahead(point: FloatArray, poses: FloatArray, seen: Keyframe) -> bool:
-    """Return whether a point (3,) is where directions seen from poses (m, 4, 4) lead."""
-    back = se3.inverse(poses)
-    lines = back[:, :3, :3] @ point + back[:, :3, 3] - (seen.points - seen.lines_of_sight)
-    ahead = np.einsum('mi,mi->m', lines, seen.lines_of_sight)
-    return not (MEASURED[seen.kinds][:, 1] & (ahead < 0.0)).any()
-
-
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:
     """Return the covariance of Ad_A ε and all else, given the one of ε and all else."""
     p = axes.p
@@ -561,16 +553,3 @@ def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> Fl
     changed[:p] = Ad @ changed[:p]
     changed[:, :p] = changed[:, :p] @ Ad.T
     return changed
-
-
-class _Warning:
-    """A warning that is given once by all copies of its owner: hypotheses are copies."""
-
-    def __init__(self) -> None:
-        self._is_given = False
-
-    def give(self) -> None:
-        if self._is_given:
-            return
-        self._is_given = True
-        logger.warning('%s', found('not_relinearised'))

@@ -238,7 +238,7 @@ class State:
         (step, slips, history), rows = self.relinearisation.smooth(), self.confirmed
         found, calibration = step.end, self.calibration
         entries = slice(self.axes.p, self.axes.p + calibration.count)
-        covariance = step.marginal()[entries, entries]
+        covariance = step.factors.marginal()[entries, entries]
         values = calibration.shifted(found.calibrations[-1] - calibration.values)
         P = self.observer.reference_pose
         return Smoothed(

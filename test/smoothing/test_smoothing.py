@@ -91,7 +91,7 @@ def test_marginal_is_that_of_the_dense_inverse(problem):
     J = problem.jacobian(problem.start)
     first = POSES * (problem.d + (problem.c if problem.drifts else 0))
     np.testing.assert_allclose(
-        smoother.smooth(problem.start, 1, 0.0).marginal(),
+        smoother.smooth(problem.start, 1, 0.0).factors.marginal(),
         np.linalg.inv(J.T @ J)[first:, first:],
         rtol=1e-4,
         atol=1e-7,
