@@ -41,100 +41,54 @@ LANDMARK_LOOP_RADIUS_M = 1.0
 class Scenario:
     """What is simulated; the defaults are section VI. Each field is a row of a parameter table."""
 
+    # fmt: off
     velocity_rate: float = parameter(
-        50.0,
-        'Rate of the velocity messages and of the true pose',
-        unit='Hz',
-        minimum=0.1,
-        maximum=1e5,
-    )
+        50.0, 'Rate of the velocity messages and of the true pose',
+        unit='Hz', minimum=0.1, maximum=1e5)
     observation_rate: float = parameter(
-        50.0, 'Rate of the landmark observations', unit='Hz', minimum=0.1, maximum=1e5
-    )
+        50.0, 'Rate of the landmark observations', unit='Hz', minimum=0.1, maximum=1e5)
     duration: float = parameter(
-        0.0, 'Simulated time after which it ends; 0 for no end', unit='s', minimum=0.0, maximum=1e7
-    )
+        0.0, 'Simulated time after which it ends; 0 for no end',
+        unit='s', minimum=0.0, maximum=1e7)
     laps: float = parameter(
-        0.0, 'Laps after which it ends; 0 for no end', minimum=0.0, maximum=1e6
-    )
+        0.0, 'Laps after which it ends; 0 for no end', minimum=0.0, maximum=1e6)
     seed: int = parameter(
-        0, 'Seed of everything random; the same seed gives the same run', minimum=0, maximum=2**62
-    )
+        0, 'Seed of everything random; the same seed gives the same run', minimum=0,
+        maximum=2**62)
     initial_bias: float = parameter(
-        0.5,
-        "Length of the bias a_i of random direction on each landmark's first sighting",
-        unit='m',
-        minimum=0.0,
-        maximum=1000.0,
-    )
+        0.5, "Length of the bias a_i of random direction on each landmark's first sighting",
+        unit='m', minimum=0.0, maximum=1000.0)
     landmark_count: int = parameter(
-        0,
-        'Landmarks in a random field; 0 for the four of the paper',
-        minimum=0,
-        maximum=10_000,
-    )
+        0, 'Landmarks in a random field; 0 for the four of the paper', minimum=0, maximum=10_000)
     landmark_distance: float = parameter(
-        4.0,
-        "Distance of every landmark from the circle's axis at z = 0",
-        unit='m',
-        minimum=0.0,
-        maximum=1e5,
-    )
+        4.0, "Distance of every landmark from the circle's axis at z = 0",
+        unit='m', minimum=0.0, maximum=1e5)
     landmark_speed: float = parameter(
-        0.0,
-        'Speed at which each landmark runs a circle of 1 m radius',
-        unit='m/s',
-        minimum=0.0,
-        maximum=1000.0,
-    )
+        0.0, 'Speed at which each landmark runs a circle of 1 m radius',
+        unit='m/s', minimum=0.0, maximum=1000.0)
     angular_velocity_noise: float = parameter(
-        0.0,
-        'Standard deviation of each angular velocity component',
-        unit='rad/s',
-        minimum=0.0,
-        maximum=1000.0,
-    )
+        0.0, 'Standard deviation of each angular velocity component',
+        unit='rad/s', minimum=0.0, maximum=1000.0)
     linear_velocity_noise: float = parameter(
-        0.0,
-        'Standard deviation of each linear velocity component',
-        unit='m/s',
-        minimum=0.0,
-        maximum=1000.0,
-    )
+        0.0, 'Standard deviation of each linear velocity component',
+        unit='m/s', minimum=0.0, maximum=1000.0)
     point_noise: float = parameter(
-        0.0,
-        'Standard deviation of each coordinate of an observed point',
-        unit='m',
-        minimum=0.0,
-        maximum=1000.0,
-    )
+        0.0, 'Standard deviation of each coordinate of an observed point',
+        unit='m', minimum=0.0, maximum=1000.0)
     field_of_view: float = parameter(
-        360.0,
-        "Full angle of the cone about the body's x axis in which landmarks are seen",
-        unit='deg',
-        minimum=0.0,
-        maximum=360.0,
-    )
+        360.0, "Full angle of the cone about the body's x axis in which landmarks are seen",
+        unit='deg', minimum=0.0, maximum=360.0)
     max_range: float = parameter(
-        0.0,
-        'Distance up to which landmarks are seen; 0 for any',
-        unit='m',
-        minimum=0.0,
-        maximum=1e6,
-    )
+        0.0, 'Distance up to which landmarks are seen; 0 for any',
+        unit='m', minimum=0.0, maximum=1e6)
     drop_fraction: float = parameter(
-        0.0, 'Fraction of the messages that never arrive', minimum=0.0, maximum=1.0
-    )
+        0.0, 'Fraction of the messages that never arrive', minimum=0.0, maximum=1.0)
     late_fraction: float = parameter(
-        0.0, 'Fraction of the messages that arrive late', minimum=0.0, maximum=1.0
-    )
+        0.0, 'Fraction of the messages that arrive late', minimum=0.0, maximum=1.0)
     max_lateness: float = parameter(
-        0.1,
-        'Longest delay of a late message; delays are uniform below it',
-        unit='s',
-        minimum=0.0,
-        maximum=3600.0,
-    )
+        0.1, 'Longest delay of a late message; delays are uniform below it',
+        unit='s', minimum=0.0, maximum=3600.0)
+    # fmt: on
 
     @property
     def end_s(self) -> float:
