@@ -1,8 +1,9 @@
 """Messages of an MCAP file, whole or damaged, in order of reception, one topic's in blocks.
 
-The library's readers give them one by one, and none of a damaged file's end. The file is read from
-its beginning to its end. Its message indexes make that faster, and its statistics say what is
-missing, but which messages it has is seen in these alone.
+The library's readers give them one by one, and none of a damaged file's end. Where statistics and
+message indexes of a file agree, chunks are decompressed, and their sums compared, when they are
+read. If not, or as soon as one turns out to be damaged, the file is read from its beginning to its
+end, as which messages it has is seen in these alone.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.recordings.sources import (
@@ -49,8 +51,11 @@ _HEADER: Final = struct.Struct('<BQ')
 _PRIVATE: Final = 0x80
 """The least opcode of records that programs may add, which others pass over."""
 
-_INDEX_HEADER: Final = 2 + 4
-"""Bytes of a message index before its entries: channel, and their length."""
+_INDEX: Final = struct.Struct('<BQHI')
+"""How a message index begins: opcode, length, channel, length of its entries."""
+
+_CHUNK_TIMES: Final = struct.Struct('<QQ')
+"""How the content of a chunk begins: when its first and its last message were received."""
 
 MESSAGE: Final = np.dtype(
     [
@@ -63,6 +68,9 @@ MESSAGE: Final = np.dtype(
     ]
 )
 """What comes before the data of a message."""
+
+_ENTRY: Final = np.dtype([('channel', '<u2'), ('stamp_ns', '<u8'), ('begin', '<u8')])
+"""What a message index says of a message: where it begins in the chunk, among others."""
 
 LEAST_LENGTH: Final = MESSAGE.itemsize - _HEADER.size
 """Length of a message without data."""
@@ -78,6 +86,8 @@ _NEXT: Final = re.compile(
     re.DOTALL,
 )
 """How a chunk begins: opcode, length, times, size and sum, compression; or how a message does."""
+
+NONE_LEFT: Final = 'can not be read: it is damaged, or no .mcap file; no whole message is left'
 
 _Take: TypeAlias = Callable[[int, bytes], None]
 """Is given the opcode and the content of a record that is no message."""
@@ -96,15 +106,18 @@ class Piece(NamedTuple):
 class McapRecords:
     """What a walk through a file finds; of a damaged one, what is before and behind the damage.
 
-    ``pieces`` are in the order of the file, ``channels`` are by their numbers.
+    ``pieces`` are in the order of the file, ``channels`` are by their numbers. ``by_indexes`` is
+    whether chunks have what their message indexes say, and are not decompressed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, by_indexes: bool = False) -> None:
+        self.by_indexes = by_indexes
         self.pieces: list[Piece] = []
         self._schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._counts: Counter[int] = Counter()
-        self._stated_count = self._lost_bytes = self._gap_ns = 0
+        self._stated = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
+        self._lost_bytes = self._gap_ns = 0
         self._is_cut_off = True
         self.start_ns = self.end_ns = 0
         self._is_behind_damage = False
@@ -118,10 +131,19 @@ class McapRecords:
         return Topic(channel.topic, ros2_type(schema.name), count, definition)
 
     @property
+    def agree(self) -> bool:
+        """Whether nothing is amiss, and the statistics count the same messages of each channel."""
+        stated = self._stated
+        counted = Counter(stated.channel_message_counts)  # where none and 0 are the same
+        schemas = {channel.schema_id for channel in self.channels.values()}
+        is_described = len(self.channels) == stated.channel_count and schemas <= {*self._schemas}
+        return is_described and not self.loss and counted == self._counts
+
+    @property
     def loss(self) -> Loss:
         """What is damaged or missing, also of what the statistics in the file count."""
         nameless = sum(self._counts[number] for number in self._counts.keys() - self.channels)
-        missing = max(self._stated_count - self._counts.total(), 0) + nameless
+        missing = max(self._stated.message_count - self._counts.total(), 0) + nameless
         return Loss(self._lost_bytes, to_s(self._gap_ns), self._is_cut_off, missing)
 
     def walk(self, data: mmap.mmap) -> None:
@@ -171,10 +193,16 @@ class McapRecords:
             channel = Channel.read(stream)
             self.channels[channel.id] = channel
         elif opcode == Opcode.STATISTICS:
-            self._stated_count = Statistics.read(stream).message_count
+            self._stated = Statistics.read(stream)
 
     def _take_piece(self, data: mmap.mmap, piece: Piece) -> None:
-        _, _, heads = content_of(data, piece, self._take_description)
+        if self.by_indexes and piece.is_chunk:
+            heads = _index_entries(data, piece.end)
+            times_ns = _CHUNK_TIMES.unpack_from(data, piece.begin)
+            if times_ns != (heads['stamp_ns'].min(), heads['stamp_ns'].max()):
+                raise ValueError('the index is wrong')
+        else:
+            _, _, heads = content_of(data, piece, self._take_description)
         if not len(heads):
             return
         first_ns, last_ns = int(heads['stamp_ns'].min()), int(heads['stamp_ns'].max())
@@ -243,7 +271,9 @@ def content_of(
     if piece.is_chunk:
         chunk = Chunk.read(ReadDataStream(BytesIO(content)))
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        content, indexed = stream.read(size), _indexed(data, piece.end)
+        # Each index is in order, and so stable sorting merges them in one pass.
+        begins = np.sort(_index_entries(data, piece.end)['begin'].astype(np.int64), kind='stable')
+        content, indexed = stream.read(size), begins[np.diff(begins, prepend=-1) != 0]
     try:
         begins = _begins(content, indexed, take)
     except (ValueError, struct.error):  # the index is wrong, or all is
@@ -254,20 +284,21 @@ def content_of(
     return np.frombuffer(content, dtype=np.uint8), begins, heads
 
 
-def _indexed(data: mmap.mmap, place: int) -> IntArray:
-    """Return where message indexes behind a chunk say that messages begin in it, in order."""
-    found = [np.empty(0, dtype=np.uint64)]
-    while place + _HEADER.size <= len(data):
-        opcode, length = _HEADER.unpack_from(data, place)
-        begin, place = place + _HEADER.size + _INDEX_HEADER, place + _HEADER.size + length
+def _index_entries(data: mmap.mmap, place: int) -> NDArray[np.void]:
+    """Return what message indexes behind a chunk say of its messages, one after the other."""
+    found = [np.empty(0, dtype=_ENTRY)]
+    while place + _INDEX.size <= len(data):
+        opcode, length, channel, _ = _INDEX.unpack_from(data, place)
+        begin, place = place + _INDEX.size, place + _HEADER.size + length
         if opcode != Opcode.MESSAGE_INDEX:
             break
-        entries = data[begin:place]
-        found.append(np.frombuffer(entries[: len(entries) // 16 * 16], '<u8')[1::2])
-    # Each index is in order, and so stable sorting merges them in one pass.
-    begins = np.sort(np.concatenate(found).astype(np.int64), kind='stable')
-    distinct: IntArray = begins[np.diff(begins, prepend=-1) != 0]
-    return distinct
+        content = data[begin:place]
+        pairs = np.frombuffer(content[: len(content) // 16 * 16], '<u8').reshape(-1, 2)
+        entries = np.empty(len(pairs), dtype=_ENTRY)
+        entries['channel'] = channel
+        entries['stamp_ns'], entries['begin'] = pairs[:, 0], pairs[:, 1]
+        found.append(entries)
+    return np.concatenate(found)
 
 
 def _begins(content: bytes, indexed: IntArray, take: _Take) -> IntArray:
@@ -341,11 +372,13 @@ class McapSource(MessageSource):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._records = McapRecords()
+        self._records = McapRecords(by_indexes=True)
         with damage_reported(path, mends=False):
             if path.stat().st_size:  # else there is nothing to map
                 with self._mapped() as data:
                     self._records.walk(data)
+                    if not self._records.agree:
+                        self._walk_all(data)
         self.start_ns, self.end_ns = self._records.start_ns, self._records.end_ns
         parts = {
             number: self._records.part(channel)
@@ -377,6 +410,10 @@ class McapSource(MessageSource):
         for messages in self._in_order(ordered):
             yield from _in_runs(messages, ordered, together)
 
+    def _walk_all(self, data: mmap.mmap) -> None:
+        self._records = McapRecords()
+        self._records.walk(data)
+
     @contextmanager
     def _mapped(self) -> Iterator[mmap.mmap]:
         with (
@@ -395,9 +432,10 @@ class McapSource(MessageSource):
             for channel, topic in self._topic_of.items()
             if topic in topics
         }
+        pieces = self._records.pieces
         waiting: list[tuple[int, int, _Messages | None]] = [
             (piece.start_ns, number, None)
-            for number, piece in enumerate(self._records.pieces)
+            for number, piece in enumerate(pieces)
             if not numbers.keys().isdisjoint(piece.channels)
         ]
         heapq.heapify(waiting)
@@ -407,7 +445,16 @@ class McapSource(MessageSource):
             while waiting:
                 _, number, messages = heapq.heappop(waiting)
                 if messages is None:
-                    messages = _messages_of(data, self._records.pieces[number], number_of)
+                    try:
+                        messages = _messages_of(data, pieces[number], number_of)
+                    except Exception:
+                        if self._records.by_indexes:
+                            self._walk_all(data)
+                        if pieces[number] in self._records.pieces:  # changed meanwhile
+                            raise
+                        if not self._records.pieces:
+                            raise RecordingError(f'{self._path}: {NONE_LEFT}') from None
+                        continue
                 else:
                     next_ns, next_number = waiting[0][:2] if waiting else (MAX_NS, number)
                     # Of equal stamps, the file's order holds

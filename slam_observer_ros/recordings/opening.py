@@ -16,7 +16,7 @@ from typing import Any, Final, TYPE_CHECKING
 
 from slam_observer_ros.common.errors import message_of, RecordingError, YamlError
 from slam_observer_ros.common.files import load_yaml, not_special, plain_value
-from slam_observer_ros.recordings.mcap_source import McapSource
+from slam_observer_ros.recordings.mcap_source import McapSource, NONE_LEFT
 from slam_observer_ros.recordings.sources import (
     by_key,
     damage_reported,
@@ -134,8 +134,6 @@ MAX_METADATA_BYTES = 10_000_000
 
 
 _BLOCK_BYTES = 1 << 20
-
-_NONE_LEFT = 'no whole message is left'
 
 
 def open_source(path: Path) -> tuple[MessageSource, str | None]:
@@ -294,7 +292,7 @@ def _open_mcap(path: Path) -> tuple[MessageSource, str | None]:
         )
     if encodings and not source.loss:
         raise RecordingError(f'{path}: its messages are not of ROS, but {", ".join(encodings)}')
-    raise RecordingError(f'{path}: can not be read: it is damaged, or no .mcap file; {_NONE_LEFT}')
+    raise RecordingError(f'{path}: {NONE_LEFT}')
 
 
 def _left_out(path: Path, source: MessageSource) -> str | None:

@@ -248,7 +248,7 @@ def damage_reported(path: Path, mends: bool = True) -> Iterator[None]:
     """
     try:
         yield
-    except ImportError:  # of a package that is not installed, and named as such
+    except (ImportError, RecordingError):  # of a package that is not installed; named already
         raise
     except Exception as error:
         reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__

@@ -12,6 +12,7 @@ import pytest
 import ros_messages as ros
 
 from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.recordings import mcap_source
 from slam_observer_ros.recordings.reader import Recording
 
 STEP_NS = 20_000_000
@@ -87,6 +88,31 @@ def test_whatever_a_file_repeats_or_indexes_all_of_its_messages_are_read(
     path = write(tmp_path / 'run.mcap', compression=compression, **options)
     found, loss, warning = contents(path)
     assert (found, bool(loss), warning) == (list(run()), False, None)
+
+
+def test_a_file_is_opened_without_decompressing_it_and_each_chunk_is_once_when_it_is_read(
+    tmp_path, monkeypatch
+):
+    chunks = []
+    decompress = mcap_source.get_chunk_data_stream
+    monkeypatch.setattr(
+        mcap_source,
+        'get_chunk_data_stream',
+        lambda chunk, **options: chunks.append(chunk) or decompress(chunk, **options),
+    )
+    source = mcap_source.McapSource(write(tmp_path / 'run.mcap'))
+    assert not chunks
+    assert sum(topic.count for topic in source.topics) == len(list(source.messages(source.topics)))
+    assert len(chunks) == len({chunk.data for chunk in chunks}) > 3
+
+
+def test_a_file_whose_only_chunk_is_damaged_is_refused(tmp_path):
+    path = write(tmp_path / 'run.mcap', chunk_size=10**6, compression=CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 255
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r'it is damaged, .* no whole message is left$'):
+        Recording(path)
 
 
 def test_what_programs_add_to_a_file_is_passed_over(tmp_path):
