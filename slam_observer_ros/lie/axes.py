@@ -11,25 +11,14 @@ from slam_observer_ros.lie import so3
 
 
 class EstimatedAxes:
-    """Coordinates of the pose error and of each landmark error that are estimated.
-
-    Attributes
-    ----------
-    pose, p : slice, int
-        EstimatedAxes of the pose error ε = (Ω, v), and how many these are.
-    point : int
-        Leading axes of a point, 2 or 3.
-    turn, turned : int, IntArray
-        How many turns of a landmark are estimated, 1 or 3, and which: about z, or about all.
-
-    """
+    """Coordinates of the pose error and of each landmark error that are estimated."""
 
     def __init__(self, pose: slice, point: int) -> None:
-        self.pose = pose
-        self.p: int = pose.stop - pose.start
-        self.point = point
-        self.turn: int = 3 - pose.start
-        self.turned: IntArray = np.arange(pose.start, 3)
+        self.pose = pose  # of the pose error ε = (Ω, v), …
+        self.p: int = pose.stop - pose.start  # … so many
+        self.point = point  # leading axes of a point, 2 or 3
+        self.turn: int = 3 - pose.start  # how many turns of a landmark, 1 or 3, …
+        self.turned: IntArray = np.arange(pose.start, 3)  # … and which: about z, or about all
         self._turned = slice(pose.start, 3)
         self._shape = (-1, point, self.p)
         turns = np.concatenate([-so3.hat(np.eye(3)), np.zeros((3, 3, 3))], axis=2)

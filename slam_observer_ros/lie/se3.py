@@ -239,11 +239,9 @@ def _closest_rotation(correlation: FloatArray) -> FloatArray:
     rank = int(np.sum(sizes > _RANK_TOLERANCE * sizes[0]))
     # R = U diag(1, Q) Vᵀ is optimal for each orthogonal Q that makes det R = 1: one sign where
     # the points span a plane or more, a whole circle of choices about a line.
-    fixed = min(rank, 2)
-    middle = np.eye(3)
-    middle[fixed:, fixed:] = _procrustes(
-        (Vt @ U)[fixed:, fixed:].T, handedness=np.linalg.det(U) * np.linalg.det(Vt)
-    )
+    fixed, middle = min(rank, 2), np.eye(3)
+    handedness = np.linalg.det(U) * np.linalg.det(Vt)
+    middle[fixed:, fixed:] = _procrustes((Vt @ U)[fixed:, fixed:].T, handedness)
     return np.asarray(U @ middle @ Vt)
 
 

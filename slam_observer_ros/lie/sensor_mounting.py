@@ -50,13 +50,8 @@ class Sensed:
 
     def select(self, mask: BoolArray | IntArray) -> Sensed:
         """Return the points that ``mask`` (m,) picks."""
-        Z = self.orientations
-        return Sensed(
-            self.sensors[mask],
-            self.origins[mask],
-            self.arms[mask],
-            None if Z is None else Z[mask],
-        )
+        Z = None if self.orientations is None else self.orientations[mask]
+        return Sensed(self.sensors[mask], self.origins[mask], self.arms[mask], Z)
 
 
 def joined_sensed(parts: list[Sensed]) -> Sensed:
@@ -135,13 +130,8 @@ def completed_lines(shown: FloatArray, expected: FloatArray, kinds: IntArray) ->
     rise = np.arctan2(expected[:, 2], level)
     rise_shown = np.arctan2(shown[:, 2], np.hypot(shown[:, 0], shown[:, 1]))
     elevation = np.where(measured_elevation, rise_shown, rise)
-    directions = np.column_stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    flat, up = np.cos(elevation), np.sin(elevation)
+    directions = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
     lengths = np.linalg.norm(np.where(measured_range[:, None], shown, expected), axis=1)
     lines: FloatArray = lengths[:, None] * directions
     return lines

@@ -181,9 +181,8 @@ class Calibration:
         """Return ψ, d and s of all sensors (s, 7), and which of the c entries they are, or −1."""
         values = self._owner.calibration[SENSORS:].reshape(-1, EACH)
         columns = np.full(values.shape, -1)
-        columns[:, self.of_sensor] = np.arange(self.of_velocity, self.count).reshape(
-            len(values), -1
-        )
+        estimated = np.arange(self.of_velocity, self.count)
+        columns[:, self.of_sensor] = estimated.reshape(len(values), -1)
         return values.copy(), columns
 
     def estimates(

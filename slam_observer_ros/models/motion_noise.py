@@ -135,10 +135,6 @@ def _squares(angular: Vector3, linear: Vector3) -> FloatArray:
     return squares
 
 
-def _some_last_longer(until_s: FloatArray, usual_s: FloatArray) -> bool:
-    return bool(np.count_nonzero(until_s > usual_s))
-
-
 def motion_noise(
     held: HeldVelocities, figures: MotionFigures
 ) -> tuple[FloatArray, FloatArray | None]:
@@ -150,47 +146,29 @@ def motion_noise(
     V, dt_s, stated = held.body_velocities, held.dt_s[:, None], None
     # White noise of the stated density, and in proportion to the mean speed: a single message is
     # noisy itself, and its square too large.
-    variances: FloatArray = figures.densities * _white_s(held.before_s, dt_s, held.usual_s)
+    variances: FloatArray = figures.densities * dt_s
+    before_s, usual_s, until_s = held.before_s, held.usual_s, held.before_s + dt_s
+    if np.count_nonzero(until_s > usual_s):  # as nearly never
+        # The errors are new in each message. Held for t, longer than the usual T, one of them has
+        # moved the robot by t/T times as much: t²/T, not t. Slip is as before.
+        grown_s = until_s * np.maximum(until_s / usual_s, 1.0)
+        grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
+        variances = figures.densities * np.repeat(grown_s, 3, axis=1)
     if np.count_nonzero(figures.scales):
         variances += (figures.scales * averaged(V, held.dt_s, SPEED_WINDOW_S)) ** 2 * dt_s
     variances = variances * figures.factors.repeat(3)
     if np.count_nonzero(held.is_stated):
         variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
-        stated = _stated(held.covariances, held.dt_s, held.before_s, figures.factors)
+        # A velocity has one error for as long as it is held, and the next message another one:
+        # held for t it has moved the robot by t times its error, in however many motions.
+        squared = dt_s * (2.0 * before_s + dt_s)  # (before + dt)² − before²
+        grown_s = np.repeat(np.sqrt(squared * figures.factors), 3, axis=1)
+        stated = limited(held.covariances, MAX_SPEED_ERRORS)
+        stated = grown_s[:, :, None] * stated * grown_s[:, None, :]
     # In a gap the robot may do anything that is allowed.
     if np.count_nonzero(held.gap_s):
         variances += np.minimum(figures.unknown * held.gap_s[:, None], MAX_GAP_ERRORS**2)
     return variances, stated
-
-
-def _stated(
-    covariances: FloatArray, dt_s: FloatArray, before_s: FloatArray, factors: FloatArray
-) -> FloatArray:
-    """Return covariances (k, 6, 6) of motions by velocities with stated covariances (k, 6, 6).
-
-    Each was held for ``dt_s`` (k,) after ``before_s`` (k, 2), seconds. A velocity has one error
-    for as long as it is held, and the next message another one: held for t it has moved the robot
-    by t times its error, in however many motions.
-    """
-    squared = dt_s[:, None] * (2.0 * before_s + dt_s[:, None])  # (before + dt)² − before²
-    grown_s = np.repeat(np.sqrt(squared * factors), 3, axis=1)
-    stated = limited(covariances, MAX_SPEED_ERRORS)
-    grown: FloatArray = grown_s[:, :, None] * stated * grown_s[:, None, :]
-    return grown
-
-
-def _white_s(before_s: FloatArray, dt_s: FloatArray, usual_s: FloatArray) -> FloatArray:
-    """Return variances over their density: (k, 6), or ``dt_s`` (k, 1) if one for all axes.
-
-    The density belongs to errors which are new in each message. Held for t, longer than the
-    usual T, one of them has moved the robot by t/T times as much: t²/T, not t. Slip is as before.
-    """
-    until_s = before_s + dt_s
-    if not _some_last_longer(until_s, usual_s):  # as nearly always
-        return dt_s
-    grown_s = until_s * np.maximum(until_s / usual_s, 1.0)
-    grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
-    return np.repeat(grown_s, 3, axis=1)
 
 
 def beyond_driving(points: FloatArray, residuals: FloatArray, settings: Settings) -> BoolArray:
@@ -334,7 +312,9 @@ def score(
     u: FloatArray, G: FloatArray, N: FloatArray, squared: float, q: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return g (2,) and F (2, 2), of q residuals at the squared distance rᵀ S⁻¹ r."""
-    w, NG = min(1.0, _rare(q) / max(squared, 1.0)), N.dot(G)
+    # What χ² of q degrees of freedom exceeds once in a hundred times (R. A. Fisher)
+    rare = 0.5 * (math.sqrt(2.0 * q - 1.0) + RARE) ** 2
+    w, NG = min(1.0, rare / max(squared, 1.0)), N.dot(G)
     g = 0.5 * (w * N.dot(u).dot(u) - N.reshape(2, -1).dot(G.ravel()))
     F = 0.5 * NG.reshape(2, -1).dot(NG.swapaxes(1, 2).reshape(2, -1).T)
     return g, F
@@ -348,8 +328,3 @@ def learnt(
     change = np.linalg.solve(information + _PRIOR, g - logs / MEMORY)
     logs = logs + np.minimum(np.maximum(change, -MAX_STEP), MAX_STEP)
     return information, np.minimum(np.maximum(logs, LEAST_LOGARITHM), LARGEST_LOGARITHM)
-
-
-def _rare(q: int) -> float:
-    """Return what χ² of q degrees of freedom exceeds once in a hundred times (R. A. Fisher)."""
-    return 0.5 * (math.sqrt(2.0 * q - 1.0) + RARE) ** 2

@@ -33,18 +33,11 @@ _IDENTITY = np.eye(3)
 
 
 class ObservationNoise:
-    """How far observed points may be off, as ``observation_model`` and its figures say.
-
-    Attributes
-    ----------
-    stood_s : float
-        For how long the robot has stood now, 0 while it moves.
-
-    """
+    """How far observed points may be off, as ``observation_model`` and its figures say."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.stood_s = 0.0
+        self.stood_s = 0.0  # for how long the robot has stood now, 0 while it moves
 
     def covariances(
         self, event: ObservationEvent, lines_of_sight: FloatArray | None = None
@@ -142,11 +135,16 @@ def orientation_covariances(Z: FloatArray, lines_of_sight: FloatArray, s: Settin
 
 def _of_known(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatArray:
     # The camera looks along the line of sight: its axes U, and the corners q in them.
-    range_m = np.linalg.norm(lines_of_sight, axis=1)
-    range_m = np.clip(range_m, LEAST_RANGE * s.tag_size, LARGEST_RANGE * s.tag_size)
-    U = _looking_along(lines_of_sight)
+    lengths = np.linalg.norm(lines_of_sight, axis=1, keepdims=True)
+    third = lines_of_sight / np.maximum(lengths, _TINY)
+    third[~third.any(axis=1)] = (0.0, 0.0, 1.0)
+    # Across the axis that it is furthest from.
+    first = np.cross(np.eye(3)[np.abs(third).argmin(axis=1)], third)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    U = np.stack([first, np.cross(third, first), third], axis=1)
     arms = s.tag_size * _CORNERS @ (U @ Z).swapaxes(-1, -2)  # (m, 4, 3)
-    q = arms + range_m[:, None, None] * np.array([0.0, 0.0, 1.0])
+    range_m = np.clip(lengths, LEAST_RANGE * s.tag_size, LARGEST_RANGE * s.tag_size)
+    q = arms + range_m[:, None] * np.array([0.0, 0.0, 1.0])
     # f (x, y) / z, by turns and shifts of the tag: dq = dω × arm + dt.
     projected = np.zeros((*q.shape[:2], 2, 3))
     projected[..., 0, 0] = projected[..., 1, 1] = 1.0 / q[..., 2]
@@ -160,15 +158,3 @@ def _of_known(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatAr
     information = turns / noise**2 + np.eye(3) / np.pi**2  # nothing is off by more
     covariances: FloatArray = U.swapaxes(-1, -2) @ np.linalg.inv(information) @ U
     return covariances
-
-
-def _looking_along(lines_of_sight: FloatArray) -> FloatArray:
-    """Return rotations (m, 3, 3) to axes whose third one is along the line of sight."""
-    third = lines_of_sight / np.maximum(
-        np.linalg.norm(lines_of_sight, axis=1, keepdims=True), _TINY
-    )
-    third[~third.any(axis=1)] = (0.0, 0.0, 1.0)
-    # Across the axis that it is furthest from.
-    first = np.cross(np.eye(3)[np.abs(third).argmin(axis=1)], third)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(third, first), third], axis=1)

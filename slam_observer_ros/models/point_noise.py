@@ -46,8 +46,12 @@ def stated_covariances(
     """Return covariances (m, 3, 3) of ``points`` as stated, or by the figures where unknown."""
     # Else far points that are said to be exact are lost beside an uncertain heading.
     least = RELATIVE_RESOLUTION**2 * np.einsum('ij,ij->i', points, points)
-    covariances = limited(stated, np.full(3, MAX_ERROR_M)) + least[:, None, None] * _IDENTITY
-    covariances = _invertible(covariances)
+    covariances: FloatArray = limited(stated, np.full(3, MAX_ERROR_M))
+    covariances = covariances + least[:, None, None] * _IDENTITY
+    # No direction is known exactly.
+    shares = MIN_SHARE * covariances.trace(axis1=1, axis2=2)
+    least = RESOLUTION_M**2 + np.minimum(shares, MOST_SHARE_M2)
+    covariances = covariances + least[:, None, None] * _IDENTITY
     unknown = ~stated.any(axis=(1, 2))
     if unknown.any():
         covariances[unknown] = point_covariances(lines_of_sight[unknown], figures)
@@ -69,14 +73,6 @@ def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
     return factors
 
 
-def _invertible(covariances: FloatArray) -> FloatArray:
-    """Return covariances (m, 3, 3) with no direction known exactly."""
-    shares = MIN_SHARE * covariances.trace(axis1=1, axis2=2)
-    least = RESOLUTION_M**2 + np.minimum(shares, MOST_SHARE_M2)
-    invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
-    return invertible
-
-
 def point_covariances(lines_of_sight: FloatArray, figures: PointFigures) -> FloatArray:
     """Return covariances (m, 3, 3) of points along ``lines_of_sight`` (m, 3), invertible.
 
@@ -91,7 +87,7 @@ def point_covariances(lines_of_sight: FloatArray, figures: PointFigures) -> Floa
     excess = (along - across) / np.maximum(squared, _TINY)
     scaled = excess[:, None] * lines_of_sight
     covariances: FloatArray = scaled[:, :, None] * lines_of_sight[:, None, :]
-    # As of _invertible, but with the trace that is known.
+    # As of stated ones, but with the trace that is known.
     shares = MIN_SHARE * (along + 2.0 * across)
     least = RESOLUTION_M**2 + np.minimum(shares, MOST_SHARE_M2)
     covariances += (across + least)[:, None, None] * _IDENTITY

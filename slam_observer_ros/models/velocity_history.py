@@ -120,8 +120,15 @@ class VelocityHistory:
             begin = stamps_ns.searchsorted(angular.stamp_ns)
             end = stamps_ns.searchsorted(angular.stamp_ns + self._timeout_ns, 'right')
             self._joined.write_angular(slice(first + begin, first + end), angular)
-        if stand:
-            self._let_stand(np.array(stand))
+        if stand:  # zero, and known to be, unless a gyroscope says otherwise
+            joined, still = self._joined, np.array(stand)
+            rates = self._counts * joined.body_velocities[still, :3]
+            turn = self._at_rest.turns(rates) & rates.any(axis=1)
+            if np.count_nonzero(turn):
+                self.doubt_standing()
+                still = still[~turn]
+            joined.body_velocities[still], joined.covariances[still] = 0.0, STANDING
+            joined.is_stated[still] = True
         return True
 
     @property
@@ -140,17 +147,6 @@ class VelocityHistory:
         self._last_zero_ns = stamp_ns
         self._stands = self._has_moved and stamp_ns >= since_ns + STANDS_NS
         return self._stands
-
-    def _let_stand(self, rows: IntArray) -> None:
-        """Let velocities (k,) be zero, and be known to be, unless a gyroscope says otherwise."""
-        joined = self._joined
-        rates = self._counts * joined.body_velocities[rows, :3]
-        turn = self._at_rest.turns(rates) & rates.any(axis=1)
-        if np.count_nonzero(turn):
-            self.doubt_standing()
-            rows = rows[~turn]
-        joined.body_velocities[rows], joined.covariances[rows] = 0.0, STANDING
-        joined.is_stated[rows] = True
 
     def doubt_standing(self) -> None:
         """Begin again to judge whether the robot stands: something else contradicts it."""
@@ -350,7 +346,10 @@ class _Periods:
             self._longest_ns.extend(sorted(self._block_ns)[-2:])
             self._block_ns = []
         if is_full or period_ns > self._usual_ns:
-            self._judge()
+            longest_ns = sorted([*self._longest_ns, *self._block_ns])[-2:]
+            if len(longest_ns) == 2:
+                self._usual_ns = longest_ns[0]
+                self.usual_s = to_s(longest_ns[0]) or math.inf
         return self.usual_s
 
     @property
@@ -358,12 +357,6 @@ class _Periods:
         """Half of the periods of late are longer, seconds; 0 while there are few."""
         few = len(self._recent_ns) < FEWEST_PERIODS
         return 0.0 if few else to_s(int(median_low(self._recent_ns)))
-
-    def _judge(self) -> None:
-        longest_ns = sorted([*self._longest_ns, *self._block_ns])[-2:]
-        if len(longest_ns) == 2:
-            self._usual_ns = longest_ns[0]
-            self.usual_s = to_s(longest_ns[0]) or math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
