@@ -62,7 +62,7 @@ class ActiveLandmarks(JointCovariance):
         """Return an independent copy; it shares large arrays until they change."""
         other = super().copy(observer)
         other._observer, observer.postponed = observer, other
-        other._following = self._following.copy(observer)
+        other._following, other._shifts = self._following.copy(observer), self._shifts.copy()
         return other
 
     @property
@@ -95,6 +95,7 @@ class ActiveLandmarks(JointCovariance):
         turn = self._axes.full_pose(x[: self._p])[:3]
         self._postponed.move(turn, x[self._entries])
         self._following.work()
+        self._shifts.clear()
 
     def note_motion(self, duration_s: float) -> None:
         """Let the next observation look at some references, by which motions are judged."""
@@ -134,9 +135,14 @@ class ActiveLandmarks(JointCovariance):
         others = rows[self._places[rows] < 0]
         if not len(others):  # as nearly always
             return np.zeros((len(rows), 3))
-        shifts = np.zeros((len(self._places), 3))
-        for view in self._following.views(others):
-            shifts[view.rows] = view.shifts
+        shifts, following = np.zeros((len(self._places), 3)), self._following
+        if self._observer.have_moved:
+            self._shifts.clear()
+        for number in set((following.slots[others] // self._outside.slots_each).tolist()):
+            if number not in self._shifts:
+                (view,) = following.views(following.out_of_view(number))
+                self._shifts[number] = view.rows, view.shifts
+            shifts[self._shifts[number][0]] = self._shifts[number][1]
         chosen: FloatArray = shifts[rows]
         return chosen
 
@@ -194,6 +200,7 @@ class ActiveLandmarks(JointCovariance):
         """Do all postponed work; let references be present estimates."""
         self._restart(self.active[:0])
         self._following.finish()
+        self._shifts.clear()
 
     def _restart(self, released: IntArray) -> None:
         """Let x start again, without landmarks (m,); change all others little by little."""
@@ -281,6 +288,8 @@ class ActiveLandmarks(JointCovariance):
         self.P[x, entries] = self.P[entries, x] = 1.0
 
     def _set_active(self, rows: IntArray, n: int) -> None:
+        # Postponed shifts (…, 3) of landmarks (…,) by panel, where somebody looked since a move
+        self._shifts: dict[int, tuple[IntArray, FloatArray]] = {}
         self.active, self._places = rows, np.full(n, -1)
         self._places[rows] = np.arange(len(rows))
 

@@ -92,11 +92,13 @@ class CompressedCovariance(ActiveLandmarks):
         m, k, p, q = len(rows), self._axes.point, self._p, C.shape[2]
         with_pose, own = np.empty((m, p, k)), np.empty((m, k, k))
         with_pose[is_active], own[is_active] = super().output(C[is_active], rows[is_active])
-        to_state, their_own = self._of_others(rows[~is_active], q)
-        C = C[~is_active]
+        # Without ids one landmark may be paired with many points.
+        unique, at = np.unique(rows[~is_active], return_inverse=True)
+        to_state, their_own = self._of_others(unique, q)
+        C, to_state = C[~is_active], to_state[at]
         PC = self.P[:q, :q] @ transpose(C) - transpose(to_state)
         with_pose[~is_active] = PC[:, :p]
-        own[~is_active] = C @ PC - to_state @ transpose(C) + their_own
+        own[~is_active] = C @ PC - to_state @ transpose(C) + their_own[at]
         return with_pose, own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:

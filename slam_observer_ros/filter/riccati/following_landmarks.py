@@ -42,11 +42,12 @@ class FollowingLandmarks:
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
         self.start(np.empty(0))
         self._changed = 0  # panels, since the last correction
+        self._moved_panels: dict[int, MovedPanel] = {}  # those of which somebody has looked
 
     def copy(self, observer: FilterArrays) -> FollowingLandmarks:
         """Return an independent copy for a copy of the observer."""
         other = copy(self)
-        other._observer = observer
+        other._observer, other._moved_panels = observer, self._moved_panels.copy()
         other.outside, other.postponed = self.outside.copy(), self.postponed.copy()
         return other
 
@@ -69,6 +70,11 @@ class FollowingLandmarks:
         return rows, rows >= 0
 
     # Views
+
+    def out_of_view(self, number: int) -> IntArray:
+        """Return the landmarks of a panel that are not in P."""
+        rows, are_out = self._in_panel(number)
+        return rows[are_out]
 
     def views(self, rows: IntArray) -> list[PanelView]:
         """Return landmarks (m,) out of view as they are now, panel by panel, ascending."""
@@ -199,10 +205,17 @@ class FollowingLandmarks:
         if self._has_turns:
             self._observer.orientations.turn(rows[are_out], moved.turns[are_out])
         self.outside.make(number, moved)
+        del self._moved_panels[number]
         self._changed += 1
 
     def _moved(self, number: int, rows: IntArray, are_out: BoolArray) -> MovedPanel:
-        return self.outside.moved(number, self._points(rows), are_out)
+        """Return a panel after its change, found once: copies that look share it."""
+        if self._observer.have_moved:
+            self._moved_panels.clear()
+        if number not in self._moved_panels:
+            moved = self.outside.moved(number, self._points(rows), are_out)
+            self._moved_panels[number] = moved
+        return self._moved_panels[number]
 
     def _turn(self, number: int, X: FloatArray) -> None:
         """Turn the tags of a panel."""

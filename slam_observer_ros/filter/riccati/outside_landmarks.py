@@ -275,7 +275,7 @@ class OutsideLandmarks:
     def make(self, number: int, moved: MovedPanel) -> None:
         """Let a panel have changed."""
         change = self.unchanged.pop(number)
-        self.panels[number] = moved.panel
+        self.panels[number] = copy(moved.panel)
         self.matrix.add(number, moved.U)
         self.matrix.set_columns(number, change.rows, moved.V)
         if not self.unchanged:
