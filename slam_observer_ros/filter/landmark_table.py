@@ -27,14 +27,6 @@ ERROR = 0.01
 SURE = math.log(1.0 / ERROR - 1.0)
 """Log odds from which on a landmark exists."""
 
-MOST_EVIDENCE = 3.0 * SURE
-"""Most evidence for a landmark without an id: what has vanished must not stay for ever."""
-
-TOO_SELDOM, LEAST_COUNT = 5, 4
-"""How many times more seldom than others a landmark may be seen that is passed by, and how often
-it counts as seen at least: few misses may be chance.
-"""
-
 MIN_SHARE, MOST_SHARE = 0.1, 0.9
 """Least and greatest share of observations in which a landmark in view is seen: of a loaded map
 it may be small, and a landmark that was seen each time may yet be hidden.
@@ -124,11 +116,10 @@ class LandmarkTable(LandmarkColumns):
     # (n,) log of how much likelier each makes what was seen of it than if it were a false point;
     # infinite where an id or a map says that it exists
     evidence: FloatArray
-    # (n,) observations without ids that had it in view, and how many since it was seen
+    # (n,) observations without ids that had it in view, how many since it was seen, and from how
+    # many other places than before: from a robot that stands it may be hidden in all of them
     in_view: IntArray
     missed: IntArray
-    # (n,) how many of them were from another place than the one before: from a robot that stands a
-    # landmark may be hidden in all of them
     passed: IntArray
     # (n,) stamp at which each was seen for the first time; −1 for one that a map had
     born_ns: IntArray
@@ -223,8 +214,8 @@ class LandmarkTable(LandmarkColumns):
         self._confirmed_in_view += int(np.sum(confirmed))
         self._confirmed_seen += int(np.sum(confirmed & seen))
         self.in_view[rows] += 1
-        self.passed[rows] += has_moved
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
+        self.passed[rows] = np.where(seen, 0, self.passed[rows] + has_moved)
 
     def note_missed(self, rows: IntArray, seen: BoolArray) -> None:
         """Count once more that rows (m,) in view were missed, but for those ``seen`` (n,)."""
@@ -237,14 +228,10 @@ class LandmarkTable(LandmarkColumns):
         self.some_without_ids = bool(is_automatic(self.ids).any())
 
     @property
-    def seen_share(self) -> float:
-        """How often a confirmed landmark without an id is seen while in view; 0 if unknown."""
-        return self._confirmed_seen / self._confirmed_in_view if self._confirmed_in_view else 0.0
-
-    @property
     def likely_share(self) -> float:
-        """:attr:`seen_share` within likely limits."""
-        return min(max(self.seen_share, MIN_SHARE), MOST_SHARE)
+        """How often a landmark without an id is seen while in view, within likely limits."""
+        share = self._confirmed_seen / max(self._confirmed_in_view, 1)
+        return min(max(share, MIN_SHARE), MOST_SHARE)
 
     @property
     def false_share(self) -> float:
@@ -262,40 +249,39 @@ class LandmarkTable(LandmarkColumns):
 
     def weigh(self, rows: IntArray, evidence: FloatArray) -> int:
         """Count evidence (m,) that ``rows`` exist; return how many surely do from now on."""
-        before, after = self.evidence[rows], self.evidence[rows] + evidence
-        self.evidence[rows] = np.where(before < np.inf, np.minimum(after, MOST_EVIDENCE), before)
-        is_sure = (after + self.prior >= SURE) & (before < np.inf)
+        self.evidence[rows] = after = self.evidence[rows] + evidence
+        is_sure = (after + self.prior >= SURE) & (after < np.inf)
         now = rows[is_sure & (self.was_sure[rows] == 0)]
         self.was_sure[now] = 1
         self._confirmed_in_view += int(np.sum(self.in_view[now]))
         self._confirmed_seen += int(np.sum(self.counts[now]))
         return len(now)
 
-    def hidden(self, rows: IntArray) -> FloatArray:
+    def hidden(self, rows: IntArray, has_moved: bool = False) -> FloatArray:
         """Return the probability that existing ``rows`` (m,), in view, are missed once more.
 
-        The rate at which one in view is seen differs between landmarks and poses. Where it is
-        exponentially distributed about its mean p, one is missed k times in a row with the
-        probability 1/(1 + k p): one that is hidden soon says little more.
+        The rate at which one in view is seen differs between landmarks and places. Where it is
+        exponentially distributed about its mean p, one is missed k times in a row from one place
+        with the probability 1/(1 + k p): one that is hidden soon says little more, from there.
+        From n places it is (1 + k p / n)⁻ⁿ.
         """
-        p, missed = self.likely_share, self.missed[rows]
-        return np.asarray((1.0 + missed * p) / (1.0 + (missed + 1.0) * p))
+        p, k, n = self.likely_share, self.missed[rows], 1 + self.passed[rows]
+        then = n + has_moved
+        before, after = n * np.log1p(k * p / n), then * np.log1p((k + 1) * p / then)
+        return np.asarray(np.exp(before - after))
 
     def unlikely(self) -> IntArray:
         """Return rows without an id that hardly exist, or no more; learn how many are false.
 
-        One that surely existed goes if it is passed by so often that it is seen
-        :data:`TOO_SELDOM` times more seldom than others; one that a map had stays in any case.
+        One that a map had stays in any case.
         """
         own = is_automatic(self.ids) & (self.born_ns >= 0)
         exist = float(self.existence(np.flatnonzero(own)).sum())
         false = float(np.count_nonzero(own)) - exist + self._false
         self.prior = math.log((exist + REAL) / max(false, FALSE))
         is_false = own & (self.evidence + self.prior < -SURE)
-        self._false += float(np.count_nonzero(is_false))
-        expected = self.passed * self.seen_share
-        has_gone = own & (expected >= TOO_SELDOM * np.maximum(self.counts, LEAST_COUNT))
-        return np.flatnonzero(is_false | has_gone)
+        self._false += float(np.count_nonzero(is_false & (self.was_sure == 0)))
+        return np.flatnonzero(is_false)
 
     def unseen_since(self, stamp_ns: int) -> IntArray:
         """Return rows not seen since a stamp: least often seen first, then longest ago."""
@@ -313,11 +299,11 @@ class LandmarkTable(LandmarkColumns):
 
     def merge(self, rows: IntArray, copies: IntArray) -> None:
         """Count what was seen of ``copies`` (m,), which are about to go, for ``rows`` (m,)."""
-        for counted in (self.counts, self.in_view, self.passed):
+        for counted in (self.counts, self.in_view):
             counted[rows] += counted[copies]
         is_later = self.last_seen_ns[copies] > self.last_seen_ns[rows]
         later, latest = rows[is_later], copies[is_later]
-        for column in (self.last_seen_ns, self.seen_before_ns, self.missed):
+        for column in (self.last_seen_ns, self.seen_before_ns, self.missed, self.passed):
             column[later] = column[latest]
         self.rejections[rows] = 0
         self.evidence[rows] = np.maximum(self.evidence[rows], self.evidence[copies])

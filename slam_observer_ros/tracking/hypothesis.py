@@ -15,7 +15,6 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_a
 from slam_observer_ros.estimates import Change
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.landmark_table import LandmarkTable
-from slam_observer_ros.lie import se3
 from slam_observer_ros.tracking.state import State
 
 HULL_MARGIN = 0.01
@@ -79,8 +78,8 @@ class FieldOfView:
 IMPROBABLE = 20.0
 """−ln of the probability below which it is no chance that none of several landmarks is seen."""
 
-MOVED_M = 0.05
-"""Distance, metres, after which a robot looks from another place; and turn, rad."""
+MOVED_M = 0.5
+"""Distance, metres, after which a robot looks from another place, where other things hide."""
 
 MAX_EVIDENCE = 2.0
 """Evidence of one observation at most: what hides a landmark hides others, and for some time."""
@@ -93,7 +92,7 @@ class Visibility:
         self.field_of_view = FieldOfView(k)
         # landmarks without an id that surely exist since the last observation, and false ones
         self.sure_now = self.false_now = 0
-        self._last_place: FloatArray | None = None  # (4, 4) Â, if it moved since the one before
+        self._last_place: FloatArray | None = None  # (3,) metres, reference frame
         # −ln of the probability that for so long none is seen of the landmarks known before: those
         # without an id that were numbered up to here.
         self._evidence = 0.0
@@ -125,9 +124,10 @@ class Visibility:
             state.counts['unexpected_place'] += 1
         # Those without an id of their own: what it costs to have missed them, and their counts.
         rows = np.flatnonzero(is_numbered & in_view)
-        cost = self._miss(landmarks, rows[~seen[rows]])
+        has_moved = self._has_moved(state)
+        cost = self._miss(landmarks, rows[~seen[rows]], has_moved)
         self.missed = self._missed(in_view & ~landmarks.tentative, seen)
-        landmarks.note_in_view(rows, seen[rows], self._has_moved(state))
+        landmarks.note_in_view(rows, seen[rows], has_moved)
         if not some_have_ids:  # landmarks of a loaded map, by their ids
             landmarks.note_missed(np.flatnonzero(~is_numbered & in_view), seen)
         self.field_of_view.include(event.points)
@@ -138,14 +138,11 @@ class Visibility:
 
     def _has_moved(self, state: State) -> bool:
         """Return whether the robot is at another place than when it last was at another one."""
-        A, last = state.observer.A, self._last_place
-        if last is not None:
-            motion = se3.inverse(last) @ A
-            turn = 0.5 * (motion[:3, :3] - motion[:3, :3].T)
-            if max(np.abs(motion[:3, 3]).max(), np.abs(turn).max()) < MOVED_M:
-                return False
-        self._last_place = A.copy()
-        return True
+        place, last = state.observer.A[:3, 3], self._last_place
+        has_moved = last is not None and bool(np.linalg.norm(place - last) >= MOVED_M)
+        if last is None or has_moved:
+            self._last_place = place.copy()
+        return has_moved
 
     def _missed(self, in_view: BoolArray, seen: BoolArray) -> float:
         """Return how many landmarks (n,) in view should have been seen, and were not."""
@@ -156,9 +153,9 @@ class Visibility:
         self._seen += int(np.count_nonzero(in_view & seen))
         return share * int(np.count_nonzero(in_view & ~seen))
 
-    def _miss(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
+    def _miss(self, landmarks: LandmarkTable, unseen: IntArray, has_moved: bool) -> float:
         """Let landmarks (u,) in view be missed once more; return what that costs."""
-        hidden, exist = landmarks.hidden(unseen), landmarks.existence(unseen)
+        hidden, exist = landmarks.hidden(unseen, has_moved), landmarks.existence(unseen)
         landmarks.weigh(unseen, np.log(hidden))
         cost = -2.0 * float(np.sum(np.log1p(exist * (hidden - 1.0))))
         return cost if self.field_of_view.is_known else 0.0
