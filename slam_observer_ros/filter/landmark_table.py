@@ -16,7 +16,7 @@ from slam_observer_ros.common.types import (
     LandmarkColumns,
 )
 
-REAL, FALSE = 1.0, 0.05
+REAL, FALSE = 19.0, 1.0
 """Landmarks without ids that existed, and false points, as if seen before the first: one in twenty
 points is false where nothing is known yet.
 """

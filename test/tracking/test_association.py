@@ -80,11 +80,11 @@ def test_the_same_events_give_the_same_bits():
 
 
 def test_what_is_seen_once_is_never_in_the_map_and_by_and_by_forgotten():
-    estimator = Estimator(SPATIAL)
-    for step in range(400):
-        stand(estimator, 0.1 * step)
+    estimator, speed = Estimator(SPATIAL), (0.0, 0.0, 0.0, 0.5, 0.0, 0.0)
+    for step in range(150):
+        stand(estimator, 0.1 * step, speed)
         stray = [[0.0, 4.0, 1.0]] if step == 20 else []
-        observe(estimator, 0.1 * step, [[3.0, 0.0, 0.0], *stray])
+        observe(estimator, 0.1 * step, [[3.0 - 0.05 * step, 0.0, 0.0], *stray])
         assert len(estimator.landmark_ids) == (1 if step >= 2 else 0)
     assert estimator.counts['unsupported_landmark'] == 1
 
@@ -243,9 +243,10 @@ def test_it_says_that_landmarks_are_seen_too_seldom_for_a_map():
     (finding,) = of_map_without_ids(estimator, None)
     assert finding.kind == 'unconfirmed_map'
     assert 'only 0 are in the map' in finding.what
-    for step in range(12, 200):
-        stand(estimator, float(step))
-        observe(estimator, float(step), np.array([[3.0, 44.0, 0.0], [3.0, 40.0, 0.0]]))
+    for step in range(12, 60):
+        stand(estimator, float(step), (0.0, 0.0, 0.0, 0.1, 0.0, 0.0))
+        ahead_m = 3.0 - 0.1 * (step - 12)
+        observe(estimator, float(step), np.array([[ahead_m, 44.0, 0.0], [ahead_m, 40.0, 0.0]]))
     assert len(estimator.landmark_ids) == 2
     assert not of_map_without_ids(estimator, None)
 

@@ -101,7 +101,7 @@ def test_a_landmark_enters_the_map_once_it_surely_exists_and_stays_while_it_may_
 
 def test_each_landmark_counts_as_new_once_also_where_nothing_was_ever_false():
     """Else it costs ever more to take a point for a new one."""
-    landmarks, row = table([3] * 50), np.array([1])
+    landmarks, row = table([3] * 150), np.array([1])
     landmarks.evidence[2:] = 3.0 * SURE
     assert landmarks.unlikely().tolist() == []
     assert landmarks.prior > SURE
