@@ -217,10 +217,6 @@ class LandmarkTable(LandmarkColumns):
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
         self.passed[rows] = np.where(seen, 0, self.passed[rows] + has_moved)
 
-    def note_missed(self, rows: IntArray, seen: BoolArray) -> None:
-        """Count once more that rows (m,) in view were missed, but for those ``seen`` (n,)."""
-        self.missed[rows] = np.where(seen[rows], 0, self.missed[rows] + 1)
-
     def _sort(self) -> None:
         # The rows in the order of their ids, and these.
         self._order: IntArray = np.argsort(self.ids)

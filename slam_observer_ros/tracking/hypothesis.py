@@ -98,7 +98,6 @@ class Visibility:
         self._evidence = 0.0
         self._newest_number = 0
         self.missed = 0.0  # confirmed landmarks that should have been seen last, and were not
-        self._in_view, self._seen = 1, 1  # confirmed landmarks so far
 
     def copy(self) -> Visibility:
         """Return an independent copy: no array is ever changed in place."""
@@ -122,14 +121,12 @@ class Visibility:
         in_view = seen | self.field_of_view.contains(state.observer.body_points(everything))
         if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
             state.counts['unexpected_place'] += 1
-        # Those without an id of their own: what it costs to have missed them, and their counts.
-        rows = np.flatnonzero(is_numbered & in_view)
-        has_moved = self._has_moved(state)
-        cost = self._miss(landmarks, rows[~seen[rows]], has_moved)
-        self.missed = self._missed(in_view & ~landmarks.tentative, seen)
+        # What it costs to have missed those without an id of their own; and counts of all.
+        has_moved, unseen = self._has_moved(state), in_view & ~seen
+        cost = self._miss(landmarks, np.flatnonzero(is_numbered & unseen), has_moved)
+        self.missed = landmarks.likely_share * np.count_nonzero(unseen & ~landmarks.tentative)
+        rows = np.flatnonzero(in_view & (is_numbered | (not some_have_ids)))
         landmarks.note_in_view(rows, seen[rows], has_moved)
-        if not some_have_ids:  # landmarks of a loaded map, by their ids
-            landmarks.note_missed(np.flatnonzero(~is_numbered & in_view), seen)
         self.field_of_view.include(event.points)
         unlikely = landmarks.unlikely()
         self.false_now = len(unlikely)
@@ -143,15 +140,6 @@ class Visibility:
         if last is None or has_moved:
             self._last_place = place.copy()
         return has_moved
-
-    def _missed(self, in_view: BoolArray, seen: BoolArray) -> float:
-        """Return how many landmarks (n,) in view should have been seen, and were not."""
-        if not self.field_of_view.is_known:
-            return 0.0
-        share = self._seen / self._in_view
-        self._in_view += int(np.count_nonzero(in_view))
-        self._seen += int(np.count_nonzero(in_view & seen))
-        return share * int(np.count_nonzero(in_view & ~seen))
 
     def _miss(self, landmarks: LandmarkTable, unseen: IntArray, has_moved: bool) -> float:
         """Let landmarks (u,) in view be missed once more; return what that costs."""
