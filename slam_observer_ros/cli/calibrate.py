@@ -320,7 +320,6 @@ _WORDS = {
     'linear_scale': 'wheel scale',
     'angular_scale': 'scale of turning',
     'angular_bias': 'bias of turning',
-    'linear_bias': 'bias of driving',
     'velocity_delay': 'delay',
     'sensor_rotation': 'mount angle',
     'sensor_translation': 'mount offset',

@@ -48,6 +48,9 @@ MAX_STAMP_NS = 2**63 - 1
 MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
 
+MAX_TURN, MAX_SPEED = 50.0, 100.0
+"""Velocities beyond which none is believed, rad/s and m/s: gyroscopes measure 35 at most."""
+
 NEARLY = 1.0 - 1e-9
 """Share of a limit below which a value is below the limit, however it is rounded."""
 
@@ -62,7 +65,7 @@ _FLOAT64 = np.dtype(np.float64)
 
 
 def check_event(event: Event, settings: Settings) -> None:
-    """Check an event's shapes and values; the settings limit velocities.
+    """Check an event's shapes and values.
 
     Raises
     ------
@@ -73,13 +76,13 @@ def check_event(event: Event, settings: Settings) -> None:
 
     """
     if isinstance(event, VelocityEvent):
-        if _is_usual(event, settings):
+        if _is_usual(event):
             return
         _check_velocity(event.body_velocity, event.covariance, 6)
-        _check_speed(event.body_velocity, settings)
+        _check_speed(event.body_velocity)
     elif isinstance(event, AngularVelocityEvent):
         _check_velocity(event.angular_velocity, event.covariance, 3)
-        _check_speed(event.angular_velocity, settings)
+        _check_speed(event.angular_velocity)
     elif isinstance(event, ObservationEvent):
         _check_observation(event)
         if settings.use_tag_orientation:
@@ -110,13 +113,12 @@ def are_vague(event: ObservationEvent) -> BoolArray:
     return np.asarray(variances.min(axis=1) >= MAX_DEVIATION**2)
 
 
-def check_velocities(velocities: VelocityBlock, settings: Settings) -> None:
+def check_velocities(velocities: VelocityBlock) -> None:
     """Raise :exc:`InvalidEventError` if :func:`check_event` might refuse one of the velocities."""
     body_velocities, covariances = velocities.body_velocities, velocities.covariances
     _check_coordinates('velocities', body_velocities, (len(velocities), 6))
     squares = np.add.reduceat(body_velocities**2, [0, 3], axis=1).max(axis=0)
-    most = np.array([settings.max_angular_velocity, settings.max_linear_velocity])
-    if (squares > NEARLY * most**2).any():
+    if (squares > NEARLY * np.array([MAX_TURN, MAX_SPEED]) ** 2).any():
         raise InvalidEventError('too_fast', 'a velocity is near the greatest that is believed')
     if covariances is not None:
         _check_array('velocity covariances', covariances, (len(velocities), 6, 6))
@@ -221,7 +223,7 @@ def _check_times(stamp_ns: int, receive_ns: int | None) -> None:
         raise InvalidEventError('wrong_type', f'receive_ns {receive_ns!r} is no int or np.int64')
 
 
-def _is_usual(event: VelocityEvent, settings: Settings) -> bool:
+def _is_usual(event: VelocityEvent) -> bool:
     """Return whether nothing is wrong with a velocity, at a tenth of what it costs to say what."""
     V, stamp_ns, receive_ns = event.body_velocity, event.stamp_ns, event.receive_ns
     if event.covariance is not None or type(V) is not np.ndarray:
@@ -233,9 +235,8 @@ def _is_usual(event: VelocityEvent, settings: Settings) -> bool:
     if receive_ns is not None and type(receive_ns) is not int:
         return False
     a, b, c, d, e, f = V.tolist()
-    turns_slowly: bool = a * a + b * b + c * c <= settings.max_angular_velocity**2
-    drives_slowly: bool = d * d + e * e + f * f <= settings.max_linear_velocity**2
-    return turns_slowly and drives_slowly
+    is_slow: bool = a * a + b * b + c * c <= MAX_TURN**2 and d * d + e * e + f * f <= MAX_SPEED**2
+    return is_slow
 
 
 def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: int) -> None:
@@ -245,15 +246,12 @@ def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: i
         _check_definite('velocity covariance', covariance)
 
 
-def _check_speed(velocity: FloatArray, settings: Settings) -> None:
+def _check_speed(velocity: FloatArray) -> None:
     """Check a velocity (Ω, v), or Ω alone, against the greatest that a robot can have."""
-    for part, unit, name in (
-        (velocity[:3], 'rad/s', 'max_angular_velocity'),
-        (velocity[3:], 'm/s', 'max_linear_velocity'),
-    ):
-        size, most = math.sqrt(part.dot(part)), getattr(settings, name)
+    for part, unit, most in ((velocity[:3], 'rad/s', MAX_TURN), (velocity[3:], 'm/s', MAX_SPEED)):
+        size = math.sqrt(part.dot(part))
         if size > most:
-            text = f'a velocity of {size:.1f} {unit} is beyond {name} ({most:g} {unit})'
+            text = f'a velocity of {size:.1f} {unit} is beyond {most:g} {unit}, as no robot moves'
             raise InvalidEventError('too_fast', text)
 
 

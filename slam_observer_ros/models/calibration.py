@@ -58,13 +58,12 @@ def _entries(parameter: str, places: Iterable[int]) -> list[Entry]:
 
 
 _PLACES = np.arange(DELAY).reshape(6, 7)  # of [M b]
-_SCALES, _BIASES = np.diagonal(_PLACES).tolist(), _PLACES[:, MOVES].tolist()
+_SCALES, _BIASES = np.diagonal(_PLACES).tolist(), _PLACES[:3, MOVES].tolist()
 # All that may be calibrated of velocities, the delay last: one more entry of M is a row more.
 OF_VELOCITY = (
     *_entries('angular_scale', _SCALES[:3]),
     *_entries('linear_scale', _SCALES[3:]),
-    *_entries('angular_bias', _BIASES[:3]),
-    *_entries('linear_bias', _BIASES[3:]),
+    *_entries('angular_bias', _BIASES),
     *_entries(DELAY_NAME, [DELAY]),
 )
 

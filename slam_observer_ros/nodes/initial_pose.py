@@ -157,6 +157,10 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
     return limited(given, MAX_POSE_ERRORS) + np.diag(assumed)
 
 
+# Age up to which a kept pose is used: a respawn, an update or new batteries take less, and who
+# stood for longer may have been pushed.
+MAX_AGE_S = 600.0
+
 # Speed beyond which a robot indoors does not drive: its odometry then is another.
 FAST_M_PER_S = 3.0
 
@@ -252,8 +256,8 @@ class KeptPose:
         age_s = time.time() - stored.time_s
         if age_s < 0.0:
             return f"by this machine's clock it was kept {-age_s:.0f} s from now"
-        if age_s > self._settings.pose_file_max_age:
-            return f'it is {age_s:.0f} s old (pose_file_max_age)'
+        if age_s > MAX_AGE_S:
+            return f'it is {age_s:.0f} s old, beyond {MAX_AGE_S:.0f} s'
         if stored.frame_id != self._settings.map_frame:
             return f"it is in frame '{stored.frame_id}', not '{self._settings.map_frame}'"
         names = [known.name for known in self._estimator.loaded_maps]

@@ -56,12 +56,6 @@ class Settings:
     max_stamp_jump: float = parameter(
         10.0, 'A stamp further ahead of all others is refused until others confirm it',
         unit='s', minimum=0.1, maximum=1e9)
-    max_linear_velocity: float = parameter(
-        100.0, 'Speed beyond which a velocity is refused (too_fast)',
-        unit='m/s', minimum=1e-3, maximum=1e6, read_only=False)
-    max_angular_velocity: float = parameter(
-        50.0, 'Rate of turn beyond which a velocity is refused (too_fast)',
-        unit='rad/s', minimum=1e-3, maximum=1e6, read_only=False)
     on_time_jump: str = parameter(
         'reset', 'When the clock jumps, as in a looped recording: reset forgets the run, hold '
         'keeps pose and map', choices=('reset', 'hold'))
@@ -136,9 +130,6 @@ class Settings:
     angular_bias: Vector3 = parameter(
         (0.0, 0.0, 0.0), 'Added to the angular velocity x y z after that, unless all of it is '
         'zero', unit='rad/s', minimum=-10.0, maximum=10.0)
-    linear_bias: Vector3 = parameter(
-        (0.0, 0.0, 0.0), 'Added to the linear velocity x y z after that, unless all of it is '
-        'zero', unit='m/s', minimum=-100.0, maximum=100.0)
     velocity_delay: float = parameter(
         0.0, 'How much later than its stamp a velocity shows in observations; below zero if '
         'stamped late', unit='s', minimum=-MAX_DELAY_S, maximum=MAX_DELAY_S)
@@ -152,9 +143,6 @@ class Settings:
         (0.005, 0.005, 0.005), "Riccati: standard deviation of the angular velocity's bias x y "
         'z, which is estimated; the default suits a MEMS gyroscope, or wheels that differ by a '
         'few thousandths; 0 for none', unit='rad/s', minimum=0.0, maximum=10.0)
-    linear_bias_stddev: Vector3 = parameter(
-        (0.0, 0.0, 0.0), "Riccati: standard deviation of the linear velocity's bias x y z, which "
-        'is estimated', unit='m/s', minimum=0.0, maximum=100.0)
     velocity_delay_stddev: float = parameter(
         0.2, 'Riccati: standard deviation of velocity_delay, which is estimated; 0 for none',
         unit='s', minimum=0.0, maximum=MAX_DELAY_S)

@@ -201,9 +201,6 @@ class ObserverNodeSettings(InputSettings):
     pose_file: str = parameter(
         '', 'File that keeps the pose, every two seconds and at the end, for the next start, as '
         '~/.ros/observer_pose.yaml; empty for none')
-    pose_file_max_age: float = parameter(
-        600.0, "Age, by the system's clock, up to which that file is used",
-        unit='s', minimum=0.0, maximum=1e9)
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
     # fmt: on
 

@@ -26,7 +26,7 @@ class TestSettings:
         landmarks = tmp_path / 'map.yaml'
         slam_observer.succeed('replay', simulated, '--map', landmarks)
         config = self.config(
-            tmp_path, f'map_file: {landmarks}, autosave_map: true, pose_file_max_age: 9'
+            tmp_path, f'map_file: {landmarks}, autosave_map: true, max_clock_offset: 9'
         )
         arguments = ('replay', simulated, '--config', config)
         errors = slam_observer(*arguments).errors

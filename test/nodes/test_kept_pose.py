@@ -41,7 +41,7 @@ def fixture_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(initial_pose.time, 'time', lambda: clock.now_s)
     path = tmp_path / 'deep' / 'pose.yaml'
     node, estimator = Mock(), Estimator(Settings(two_d_mode=True))
-    settings = ObserverNodeSettings(pose_file=str(path), pose_file_max_age=60.0)
+    settings = ObserverNodeSettings(pose_file=str(path))
     odometry = SimpleNamespace(
         newest_ns=None, pose_until=lambda stamp_ns: odometry.pose, pose=None
     )
@@ -173,7 +173,7 @@ def test_the_robot_starts_where_it_was(kept):
 @pytest.mark.parametrize(
     ('written', 'reason'),
     [
-        (stored(time_s=1e9 - 61.0), 'it is 61 s old'),
+        (stored(time_s=1e9 - 601.0), 'it is 601 s old'),
         (stored(time_s=1e9 + 100.0), "by this machine's clock it was kept 100 s from now"),
         (stored(frame_id='hall'), "it is in frame 'hall'"),
     ],
