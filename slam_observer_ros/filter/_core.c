@@ -267,11 +267,6 @@ static long rows_up_to(const i64 *stamps_ns, long count, i64 stamp_ns, int and_a
     return low;
 }
 
-static void only_counting(double V[6], int is_planar) {
-    if (is_planar)
-        V[0] = V[1] = V[5] = 0.0;
-}
-
 static int is_zero(const double *v, int n) {
     for (int j = 0; j < n; j++)
         if (v[j] != 0.0)
@@ -309,7 +304,8 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
         if (piece->is_stated[0] || piece->is_stated[1])
             memcpy(piece->stated, v->covariances + 36 * row, sizeof piece->stated);
         memcpy(piece->V, v->V + 6 * row, sizeof piece->V);
-        only_counting(piece->V, is_planar);
+        if (is_planar)
+            piece->V[0] = piece->V[1] = piece->V[5] = 0.0;
         piece->moves = !is_zero(piece->V, 6);
     }
     return 1;
@@ -463,22 +459,9 @@ static int mean_about(i64 stamp_ns, const Velocities *v, const Interval *interva
     }
     for (int j = 0; j < 6; j++)
         mean[j] = known_s != 0.0 ? mean[j] / known_s : 0.0;
-    only_counting(mean, is_planar);
+    if (is_planar)
+        mean[0] = mean[1] = mean[5] = 0.0;
     return 1;
-}
-
-/* Of a delay, F is what the velocity at its two ends differs by. */
-static void fill_delay(const FilterState *x, const double *first, const double *last,
-                       const double at_start[6], const double at_end[6], double *F) {
-    double before[6], after[6];
-    calibrated(x, at_start, before);
-    calibrated(x, at_end, after);
-    for (int s = 0; s < x->p; s++) {
-        double sum = 0.0;
-        for (int j = 0; j < 6; j++)
-            sum += first[6 * s + j] * before[j] - last[6 * s + j] * after[j];
-        F[s * x->c + x->c_v - 1] = sum;
-    }
 }
 
 /* (27)  A <- A exp(V dt) along the pieces, with noise, F and Ad at both ends. */
@@ -504,11 +487,8 @@ static void follow_path(const FilterState *x, const Piece *pieces, long k, const
         Pose step = exponential(twist);
         pose = composed(&pose, &step);
     }
-    for (int s = 0; s < p; s++)
-        for (int t = 0; t < s; t++) {
-            out->noise[s * p + t] = out->noise[t * p + s];
-            out->of_turning[s * p + t] = out->of_turning[t * p + s];
-        }
+    mirror(out->noise, p, p);
+    mirror(out->of_turning, p, p);
     normalise(pose.R);
     write_pose(&pose, out->A);
 }
@@ -601,9 +581,17 @@ static int advance(const FilterState *x, const Velocities *v, const Interval *in
         }
         status = some_move && !some_are_empty ? DONE : AT_REST;
         follow_path(x, pieces, k, out, ad_first, ad_last);
-        if (interval->reach_ns) {
+        if (interval->reach_ns) { /* of a delay, F is what the velocity at its ends differs by */
+            double before[6], after[6];
             memcpy(out->at_end, at_end, sizeof at_end);
-            fill_delay(x, ad_first + 6 * x->pose, ad_last + 6 * x->pose, at_start, at_end, out->F);
+            calibrated(x, at_start, before);
+            calibrated(x, at_end, after);
+            for (int s = 0, row = 6 * x->pose; s < x->p; s++, row += 6) {
+                double sum = 0.0;
+                for (int j = 0; j < 6; j++)
+                    sum += ad_first[row + j] * before[j] - ad_last[row + j] * after[j];
+                out->F[s * x->c + x->c_v - 1] = sum;
+            }
         }
         spread(x, out->noise, out->F, (double *)(memory + pieces_size));
         for (long q = 0; q < x->c; q++)
@@ -666,14 +654,14 @@ static void point_covariance(const double line[3], const PointFigures *figures, 
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++)
             C[3 * i + j] = excess * line[i] * line[j];
-    const double share = MIN_SHARE * (along + 2.0 * across);
-    add_to_diagonal(C, across + RESOLUTION_M * RESOLUTION_M + fmin(share, MOST_SHARE_M2));
+    double share = fmin(MIN_SHARE * (along + 2.0 * across), MOST_SHARE_M2);
+    add_to_diagonal(C, across + RESOLUTION_M * RESOLUTION_M + share);
 }
 
-/* That of a point y as stated, such that it can be inverted; by the figures if it is unknown. */
-static void stated_covariance(const double y[3], const double stated[9], const double line[3],
+/* That of a point y as stated, such that it can be inverted; by the figures if it is not. */
+static void stated_covariance(const double y[3], const double *stated, const double line[3],
                               const PointFigures *figures, double C[9]) {
-    if (is_zero(stated, 9)) {
+    if (stated == NULL || is_zero(stated, 9)) {
         point_covariance(line, figures, C);
         return;
     }
@@ -717,31 +705,27 @@ static void calibrated_point(const Seen *seen, long i, const double turned[9], i
 /* D = R (-hat(l) J(psi), I, l) on k axes, of a point at l from the sensor. */
 static void fill_sensitivity(const FilterState *x, const Seen *seen, const double R_hat[9],
                              const double J[9], const double l[3], double *D) {
-    double K[9], of_turn[9], column[3], turned[3];
-    hat(l, K);
-    times(K, J, of_turn);
+    double of_all[21], column[3], turned[3];
+    sensor_matrix(J, l, of_all);
     memset(D, 0, (size_t)(x->k * x->c) * sizeof(double));
     for (long j = 0; j < seen->c_s; j++) {
-        int e = (int)seen->of_sensor[j];
         for (int b = 0; b < 3; b++)
-            column[b] = e < 3 ? -of_turn[3 * b + e] : e < 6 ? (double)(e - 3 == b) : l[b];
+            column[b] = of_all[7 * b + seen->of_sensor[j]];
         turn(R_hat, column, turned);
         for (int b = 0; b < x->k; b++)
             D[b * x->c + seen->column + j] = turned[b];
     }
 }
 
-static double unseen_s(const Landmarks *table, i64 row, i64 stamp_ns) {
+/* By how much the noise of a landmark's points grows, as its errors last since it was seen. */
+static double repetition_factor(const Landmarks *table, i64 row, i64 stamp_ns,
+                                double error_time_s) {
     i64 last_ns = table->last_seen_ns[row];
     if (last_ns == stamp_ns) /* by another sensor */
         last_ns = table->seen_before_ns[row];
-    return last_ns < 0 ? INFINITY : (double)(stamp_ns - last_ns) / 1e9;
-}
-
-static double repetition_factor(double dt_s, double error_time_s) {
-    if (error_time_s == 0.0)
+    if (last_ns < 0 || error_time_s == 0.0)
         return 1.0;
-    double fresh = -expm1(-larger(dt_s, MIN_INTERVAL_S) / error_time_s);
+    double fresh = -expm1(-larger(seconds(stamp_ns, last_ns), MIN_INTERVAL_S) / error_time_s);
     return (2.0 - fresh) / fresh;
 }
 
@@ -842,10 +826,7 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
         double stretch = sqrt(dot3(towards, towards) / measured);
         for (int b = 0; b < 3; b++)
             line[b] = stretch * arm[b];
-        if (seen->covariances)
-            stated_covariance(y, stated, line, figures, C);
-        else
-            point_covariance(line, figures, C);
+        stated_covariance(y, seen->covariances ? stated : NULL, line, figures, C);
         double in_reference[9];
         turned_covariance(pose.R, C, in_reference);
         for (int b = 0; b < k; b++) {
@@ -860,8 +841,8 @@ static int fill_residuals(const FilterState *x, const Landmarks *table, const Se
         else if (seen->D != NULL)
             memcpy(res->D + k * x->c * i, seen->D + 3 * x->c * j,
                    (size_t)(k * x->c) * sizeof(double));
-        double dt_s = unseen_s(table, row, seen->stamp_ns);
-        out->repeated[j] = res->repeated[i] = repetition_factor(dt_s, limits->error_time_s);
+        out->repeated[j] = res->repeated[i] =
+            repetition_factor(table, row, seen->stamp_ns, limits->error_time_s);
         res->rows[i] = row, res->at[i++] = j;
     }
     res->m = i, res->M = k * i;
@@ -932,37 +913,39 @@ static void fill_predicted(const FilterState *x, Residuals *res) {
     measure_columns(res, res->predicted);
 }
 
-/* L L' = S, z = L^-1 r and S^-1 r; 0 where S is indefinite. */
-static int solve(Residuals *res) {
-    long M = res->M;
-    memcpy(res->L, res->S, (size_t)(M * M) * sizeof(double));
-    if (!factor(res->L, M))
+/* L, S = L L', in place, z = L^-1 r and S^-1 r, which may be one; 0 where S is indefinite. */
+static int solve(const Residuals *res, double *S, double *z, double *S_inv_r) {
+    size_t size = (size_t)res->M * sizeof(double);
+    if (!factor(S, res->M))
         return 0;
-    memcpy(res->z, res->r, (size_t)M * sizeof(double));
-    solve_lower(res->L, M, res->z);
-    memcpy(res->S_inv_r, res->z, (size_t)M * sizeof(double));
-    solve_upper(res->L, M, res->S_inv_r);
+    memcpy(z, res->r, size);
+    solve_lower(S, res->M, z);
+    memmove(S_inv_r, z, size);
+    solve_upper(S, res->M, S_inv_r);
     return 1;
 }
 
-/* S = C P C' + R, and which points pass the gate, weights 1; how many, or -1 where S is
- * indefinite. */
+/* S = C P C' + R of the points, and its factor; 0 where S is indefinite. */
+static int predict(const FilterState *x, Residuals *res) {
+    fill_predicted(x, res);
+    with_noise(res, res->predicted, NULL, NULL, res->S);
+    memcpy(res->L, res->S, (size_t)(res->M * res->M) * sizeof(double));
+    return solve(res, res->L, res->z, res->S_inv_r);
+}
+
+/* Which points pass the gate, weights 1; how many, or -1 where S is indefinite. */
 static long judge(const FilterState *x, const Seen *seen, double gate, const Observed *out,
                   Residuals *res) {
     long passed = res->m, of_all = seen->m;
     int k = res->k;
-    fill_predicted(x, res);
-    with_noise(res, res->predicted, NULL, NULL, res->S);
-    if (!solve(res))
+    if (!predict(x, res))
         return -1;
     /* No residual is further out than all of them together are. */
     int all_pass = sum_of_squares(res->z, res->M) <= gate * gate;
     for (long i = 0; i < res->m; i++)
         out->weights[res->at[i]] = 1.0;
     for (long i = 0; i < res->m && (!all_pass || out->judges); i++) {
-        double block[9];
-        copy_block(res->S, res->M, i, k, block);
-        double square = squared_distance(res->r + k * i, block, k);
+        double square = squared_distance(res->r, res->S, res->M, k * i, k);
         if (out->judges) {
             out->judged[res->at[i]] = sqrt(larger(square, 0.0));
             out->judged[of_all + res->at[i]] = -INFINITY;
@@ -1078,9 +1061,7 @@ static int learn(const FilterState *x, const Factors *factors, double gate, cons
         }
         passed = 0;
         for (long i = 0; i < M; i += k) {
-            double block[9];
-            copy_block(L, M, i / k, k, block);
-            double square = squared_distance(z + i, block, k);
+            double square = squared_distance(z, L, M, i, k);
             for (int b = 0; b < k && square >= 0.0 && sqrt(square) <= gate; b++)
                 kept[passed++] = at[i + b];
         }
@@ -1121,11 +1102,8 @@ static int fill_weights(double huber, Residuals *res, double *work) {
         int all_count = 1;
         if (round) {
             with_noise(res, res->predicted, NULL, res->weights, L);
-            if (!factor(L, M))
+            if (!solve(res, L, s, s))
                 return 0;
-            memcpy(s, res->r, (size_t)M * sizeof(double));
-            solve_lower(L, M, s);
-            solve_upper(L, M, s);
         }
         for (long i = 0; i < res->m; i++) {
             double square = 0.0;
@@ -1207,23 +1185,20 @@ static int correct(const FilterState *x, Residuals *res, double *L) {
 
 /* (28)  X <- exp(dx) X:  A <- exp(eps) A,  y_i <- exp(eps_turn) y_i + J(eps_turn) xi_i */
 static void move(const FilterState *x, const double *dx, const Observed *out) {
-    double twist[6] = {0.0}, R_D[9], J[9], shift[3];
+    double twist[6] = {0.0}, J[9];
     memcpy(twist + x->pose, dx, (size_t)x->p * sizeof(double));
-    exp_and_jacobian(twist, R_D, J);
-    turn(J, twist + 3, shift);
-    Pose before = pose_of(x->A), after;
-    times(R_D, before.R, after.R);
-    turn(R_D, before.x, after.x);
-    for (int b = 0; b < 3; b++)
-        after.x[b] += shift[b];
+    Pose before = pose_of(x->A), D, after;
+    exp_and_jacobian(twist, D.R, J);
+    turn(J, twist + 3, D.x);
+    after = composed(&D, &before);
     write_pose(&after, out->A);
     for (long i = 0; i < x->n && x->stride; i++) {
         const double *y_ref = x->y_ref + 3 * i;
         double *a = x->a + 3 * i, xi[3] = {0.0}, moved[3], turned[3], turned_a[3];
         memcpy(xi, dx + x->first + x->stride * i, (size_t)x->k * sizeof(double));
         turn(J, xi, moved);
-        turn(R_D, y_ref, turned);
-        turn(R_D, a, turned_a);
+        turn(D.R, y_ref, turned);
+        turn(D.R, a, turned_a);
         for (int b = 0; b < 3; b++)
             a[b] = turned_a[b] + (moved[b] + (turned[b] - y_ref[b]));
     }
@@ -1288,9 +1263,7 @@ static int observe(const FilterState *x, const Landmarks *table, const Seen *see
             status = UNUSUAL;
         if (status == DONE && passed < m) {
             fill_residuals(x, table, seen, figures, limits, out, 1, &res);
-            fill_predicted(x, &res);
-            with_noise(&res, res.predicted, NULL, NULL, res.S);
-            status = solve(&res) ? DONE : UNUSUAL;
+            status = predict(x, &res) ? DONE : UNUSUAL;
         }
         if (status == DONE && out->judges && res.m)
             write_densities(&res, seen->m, out->judged);
@@ -1367,16 +1340,9 @@ static PyObject *py_observe(PyObject *Py_UNUSED(self), PyObject *const *args, Py
 }
 
 static PyMethodDef methods[] = {
-    {"advance", (PyCFunction)(void (*)(void))py_advance, METH_FASTCALL, "As step.advance."},
-    {"observe", (PyCFunction)(void (*)(void))py_observe, METH_FASTCALL, "As step.observe."},
+    METHOD("advance", py_advance, "As step.advance."),
+    METHOD("observe", py_observe, "As step.observe."),
     {NULL, NULL, 0, NULL},
 };
 
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, .m_name = "_core", .m_doc = "The step in C.", .m_size = 0,
-    .m_methods = methods,
-};
-
-PyMODINIT_FUNC PyInit__core(void) {
-    return make_module(&definition);
-}
+MODULE(_core, "The step in C.")

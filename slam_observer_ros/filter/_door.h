@@ -44,18 +44,6 @@ static inline int refuse(const char *what) {
     return 0;
 }
 
-/* A copy that lasts until the door is closed; NULL with an error. */
-static inline void *copy_at_door(Door *door, const Py_buffer *view, const char *what) {
-    void *copy = door->copied < MAX_COPIES ? PyMem_Malloc((size_t)view->len + 1) : NULL;
-    if (copy == NULL) {
-        refuse(what);
-        return NULL;
-    }
-    if (view->len)
-        memcpy(copy, view->buf, (size_t)view->len);
-    return door->copies[door->copied++] = copy;
-}
-
 /* The address of an array as ``spec`` describes it, a kind and its shape; NULL with an error. */
 static inline void *read_array(Door *door, PyObject *array, const char *spec, const char *what) {
     static double nothing; /* of an array without entries there may be no address */
@@ -77,11 +65,17 @@ static inline void *read_array(Door *door, PyObject *array, const char *spec, co
         *size = *size == UNBOUND ? view->shape[d] : *size;
         is_fit = view->shape[d] == *size;
     }
-    if (!is_fit)
+    void *address = !is_fit ? NULL : view->buf == NULL ? &nothing : view->buf;
+    if (is_fit && spec[0] == 'x') { /* a copy lasts until the door is closed */
+        void *copy = door->copied < MAX_COPIES ? PyMem_Malloc((size_t)view->len + 1) : NULL;
+        if (copy != NULL)
+            address = door->copies[door->copied++] = memcpy(copy, address, (size_t)view->len);
+        else
+            address = NULL;
+    }
+    if (address == NULL)
         refuse(what);
-    else if (spec[0] == 'x')
-        return copy_at_door(door, view, what);
-    return !is_fit ? NULL : view->buf == NULL ? &nothing : view->buf;
+    return address;
 }
 
 /* Read a number of a kind as it lies in an object of Python's own types: no method is called. */
@@ -127,13 +121,19 @@ static inline int read_fields(Door *door, PyObject *tuple, const char *const spe
     return 1;
 }
 
-/* A module that says which sources it was built from, as setup.py does to the compiler. */
-static inline PyObject *make_module(PyModuleDef *definition) {
-    PyObject *module = PyModule_Create(definition);
-    if (module != NULL && PyModule_AddIntConstant(module, "SOURCES", SOURCES))
-        Py_CLEAR(module);
-    return module;
-}
+/* A module of ``methods`` that says which sources it was built from, as setup.py has it. */
+#define MODULE(name, what) \
+    static struct PyModuleDef definition = { \
+        PyModuleDef_HEAD_INIT, .m_name = #name, .m_doc = what, .m_methods = methods, \
+    }; \
+    PyMODINIT_FUNC PyInit_##name(void) { \
+        PyObject *module = PyModule_Create(&definition); \
+        if (module != NULL && PyModule_AddIntConstant(module, "SOURCES", SOURCES)) \
+            Py_CLEAR(module); \
+        return module; \
+    }
+#define METHOD(name, function, what) \
+    {name, (PyCFunction)(void (*)(void))function, METH_FASTCALL, what}
 
 static inline int are_within(const i64 *numbers, Py_ssize_t count, i64 least, i64 most) {
     for (Py_ssize_t j = 0; j < count; j++)

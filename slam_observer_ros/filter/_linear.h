@@ -163,30 +163,24 @@ static inline void solve_lower_rows(const double *L, long n, double *B, long wid
     }
 }
 
-/* The squared Mahalanobis distance of r (k) in a covariance (k x k); -1 if that is indefinite. */
-static inline double squared_distance(const double *r, const double *covariance, int k) {
-    double L[9], z[3];
-    memcpy(L, covariance, (size_t)(k * k) * sizeof(double));
-    memcpy(z, r, (size_t)k * sizeof(double));
-    if (!factor(L, k))
-        return -1.0;
-    solve_lower(L, k, z);
-    double square = 0.0;
-    for (int b = 0; b < k; b++)
-        square += z[b] * z[b];
-    return square;
-}
-
-static inline void copy_block(const double *S, long n, long i, int k, double *block) {
-    for (int b = 0; b < k; b++)
-        memcpy(block + b * k, S + (i * k + b) * n + i * k, (size_t)k * sizeof(double));
-}
-
 static inline double sum_of_squares(const double *z, long n) {
     double sum = 0.0;
     for (long i = 0; i < n; i++)
         sum += z[i] * z[i];
     return sum;
+}
+
+/* The squared Mahalanobis distance of the k entries of r (n) from i on, by their covariance in S
+ * (n x n); -1 if that is indefinite. */
+static inline double squared_distance(const double *r, const double *S, long n, long i, int k) {
+    double L[9], z[3];
+    for (int b = 0; b < k; b++)
+        memcpy(L + b * k, S + (i + b) * n + i, (size_t)k * sizeof(double));
+    memcpy(z, r + i, (size_t)k * sizeof(double));
+    if (!factor(L, k))
+        return -1.0;
+    solve_lower(L, k, z);
+    return sum_of_squares(z, k);
 }
 
 #endif

@@ -62,17 +62,18 @@ static inline void lower_triangular(const double D[9], const double L[9], double
     }
 }
 
-static inline void left_jacobian(const double xi[6], double J[36]) {
-    double R[9], D[9], Q[9];
-    exp_and_jacobian(xi, R, D);
-    coupling(xi, Q);
+static inline void right_jacobian(const double xi[6], double J[36]) { /* the left one at -xi */
+    double minus[6] = {-xi[0], -xi[1], -xi[2], -xi[3], -xi[4], -xi[5]}, R[9], D[9], Q[9];
+    exp_and_jacobian(minus, R, D);
+    coupling(minus, Q);
     lower_triangular(D, Q, J);
 }
 
-static inline void left_jacobian_inverse(const double xi[6], double J[36]) {
+static inline void right_jacobian_inverse(const double xi[6], double J[36]) {
+    double minus[6] = {-xi[0], -xi[1], -xi[2], -xi[3], -xi[4], -xi[5]};
     double D[9], Q[9], half[9], L[9];
-    inverse_jacobian(xi, D);
-    coupling(xi, Q);
+    inverse_jacobian(minus, D);
+    coupling(minus, Q);
     times(D, Q, half);
     times(half, D, L);
     for (int i = 0; i < 9; i++)
@@ -126,6 +127,16 @@ static inline Pose inverse_of(const Pose *T) {
 static inline Pose from_to(const Pose *A, const Pose *B) { /* A^-1 B */
     Pose back = inverse_of(A);
     return composed(&back, B);
+}
+
+/* D = [-hat(l) J(psi), I, l], 3 x 7: how a point at l from its sensor changes with that. */
+static inline void sensor_matrix(const double J[9], const double l[3], double D[21]) {
+    double K[9], of_turn[9];
+    hat(l, K);
+    times(K, J, of_turn);
+    for (int t = 0; t < 3; t++)
+        for (int j = 0; j < 7; j++)
+            D[7 * t + j] = j < 3 ? -of_turn[3 * t + j] : j < 6 ? (double)(t == j - 3) : l[t];
 }
 
 static inline void seen_from(const Pose *T, const double p[3], double y[3]) { /* R' (p - x) */

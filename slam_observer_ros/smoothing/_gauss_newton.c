@@ -25,13 +25,6 @@ typedef struct {
     long S, M, n, b, d, c, k;
 } Equations;
 
-static int are_in_order(const i64 *numbers, long count) {
-    for (long j = 1; j < count; j++)
-        if (numbers[j] < numbers[j - 1])
-            return 0;
-    return 1;
-}
-
 static int read_equations(Door *door, PyObject *tuple, Equations *eq) {
     static const char *const specs[] = {"DSdd", "DAdd", "DSdc", "xM",  "xM", "DMdk",
                                         "Ddb",  "Dbb",  "DSd",  "Db", NULL};
@@ -47,9 +40,10 @@ static int read_equations(Door *door, PyObject *tuple, Equations *eq) {
         || (eq->b - eq->c) % eq->k)
         return refuse("Equations");
     eq->n = (eq->b - eq->c) / eq->k;
-    return (are_within(eq->poses, eq->M, 0, eq->S - 1) && are_in_order(eq->poses, eq->M)
-            && are_within(eq->landmarks, eq->M, 0, eq->n - 1))
-           || refuse("Equations");
+    for (long m = 0; m < eq->M; m++) /* in order */
+        if (eq->poses[m] < (m ? eq->poses[m - 1] : 0) || eq->poses[m] >= eq->S)
+            return refuse("Equations");
+    return are_within(eq->landmarks, eq->M, 0, eq->n - 1) || refuse("Equations");
 }
 
 typedef struct {
@@ -86,11 +80,6 @@ typedef struct {
 } Weighing;
 
 static const char *const WEIGHING[] = {"f", "f", "b", NULL};
-
-static int read_axes(const Equations *eq, const Weighing *weighing) {
-    return (eq->d == (weighing->is_planar ? 3 : 6) && eq->k == (weighing->is_planar ? 2 : 3))
-           || refuse("Weighing");
-}
 
 static int read_prior(Door *door, PyObject *tuple, const Equations *eq, Prior *prior) {
     static const char *const specs[] = {"d44", "dc", "dm3", "dNN", "b", NULL};
@@ -215,25 +204,20 @@ static void pull_back(const Equations *eq, const Prior *prior, const double *J_e
     memcpy(rows, top, (size_t)(d * width) * sizeof(double));
 }
 
-static void transpose_square(double *M, long N) {
-    for (long i = 0; i < N; i++)
-        for (long j = i + 1; j < N; j++) {
-            double entry = M[i * N + j];
-            M[i * N + j] = M[j * N + i];
-            M[j * N + i] = entry;
-        }
+static void transposed(const double *M, long d, double *out) {
+    for (long i = 0; i < d; i++)
+        for (long j = 0; j < d; j++)
+            out[i * d + j] = M[j * d + i];
 }
 
 /* e of the pose, the calibration and the points; J_eta, and C of each point. */
 static void prior_error(const Equations *eq, const Prior *prior, const Solution *at, double *e,
                         double *J_eta, double *C) {
     Pose before = pose_of(prior->pose), now = pose_of(at->poses), off = from_to(&before, &now);
-    double eta[6], back[6], J[36];
+    double eta[6], J[36];
     long d = eq->d, pose = d == 3 ? 2 : 0;
     logarithm(&off, eta);
-    for (int j = 0; j < 6; j++)
-        back[j] = -eta[j];
-    left_jacobian_inverse(back, J);
+    right_jacobian_inverse(eta, J);
     estimated(J, d, 1.0, J_eta);
     memcpy(e, eta + pose, (size_t)d * sizeof(double));
     for (long j = 0; j < eq->c; j++)
@@ -252,19 +236,19 @@ static void prior_error(const Equations *eq, const Prior *prior, const Solution 
     }
 }
 
-/* ``work``: N (N + d + 2) + k m d + d d. */
+/* ``work``: N (2 N + d + 2) + k m d + d d. */
 static void add_prior(const Equations *eq, const Prior *prior, const Solution *at, double *work) {
     long N = prior->N, d = eq->d, known = N - d;
-    double *H = work, *g = H + N * N, *e = g + N, *top = e + N, *J_eta = top + d * N;
-    double *C = J_eta + d * d;
+    double *JW = work, *H = JW + N * N, *g = H + N * N, *e = g + N, *top = e + N;
+    double *J_eta = top + d * N, *C = J_eta + d * d;
     Pose now = pose_of(at->poses);
     const double *R = prior->is_relative ? now.R : NULL;
     prior_error(eq, prior, at, e, J_eta, C);
-    memcpy(H, prior->information, (size_t)(N * N) * sizeof(double));
-    product(H, e, g, N, N, 1);
+    memcpy(JW, prior->information, (size_t)(N * N) * sizeof(double));
+    product(JW, e, g, N, N, 1);
     pull_back(eq, prior, J_eta, C, R, g, 1, top);
-    pull_back(eq, prior, J_eta, C, R, H, N, top);
-    transpose_square(H, N);
+    pull_back(eq, prior, J_eta, C, R, JW, N, top);
+    transposed(JW, N, H);
     pull_back(eq, prior, J_eta, C, R, H, N, top);
     add_block(eq->diagonal, d, H, N, d, d);
     add_block(eq->first, eq->b, H + d, N, d, known);
@@ -281,7 +265,7 @@ static void motion_error(const Equations *eq, const Links *links, const Solution
                          double *e, double *J, double *work) {
     long d = eq->d, c = eq->c, q = 2 * d + c, pose = d == 3 ? 2 : 0;
     const double *F = links->sensitivities + s * d * c;
-    double eta[6] = {0.0}, minus[6], error[6], Ad[36], Jl[36], of_off[36];
+    double eta[6] = {0.0}, error[6], Ad[36], Jr[36], of_off[36];
     for (long i = 0; i < d; i++)
         for (long j = 0; j < c; j++)
             eta[pose + i] += F[i * c + j] * (at->calibration[j] - links->calibrations[s * c + j]);
@@ -294,10 +278,8 @@ static void motion_error(const Equations *eq, const Links *links, const Solution
     memcpy(e, error + pose, (size_t)d * sizeof(double));
     /* Derivatives by the pose after the motion, by that before, and by the calibration. */
     double J_to[36], by_before[36], J_from[36];
-    for (int j = 0; j < 6; j++)
-        minus[j] = -error[j];
-    left_jacobian_inverse(minus, Jl);
-    estimated(Jl, d, 1.0, J_to);
+    right_jacobian_inverse(error, Jr);
+    estimated(Jr, d, 1.0, J_to);
     adjoint(&back, Ad);
     estimated(Ad, d, -1.0, by_before);
     product(J_to, by_before, J_from, d, d, d);
@@ -306,11 +288,9 @@ static void motion_error(const Equations *eq, const Links *links, const Solution
     add_block(J + d, q, J_to, d, d, d);
     if (!c)
         return;
-    for (int j = 0; j < 6; j++)
-        minus[j] = -eta[j];
     adjoint(&there_and_back, Ad);
-    left_jacobian(minus, Jl);
-    product(Ad, Jl, of_off, 6, 6, 6);
+    right_jacobian(eta, Jr);
+    product(Ad, Jr, of_off, 6, 6, 6);
     estimated(of_off, d, -1.0, by_before);
     product(J_to, by_before, J_from, d, d, d);
     product(J_from, F, work, d, d, c);
@@ -353,21 +333,14 @@ static double weight_of(const double *e, const double *information, long k,
  * that changes with its values at l from it (sensor_mounting.py). */
 static void sense(const Seen *seen, long m, const double predicted[3], double y[3], double D[21]) {
     const double *values = seen->values + 7 * seen->sensors[m], *origin = seen->origins + 3 * m;
-    double R[9], J[9], turned[3], l[3], K[9], KJ[9];
+    double R[9], J[9], turned[3], l[3];
     exp_and_jacobian(values, R, J);
     turn(R, seen->arms + 3 * m, turned);
     for (int t = 0; t < 3; t++) {
         y[t] = origin[t] + values[3 + t] + exp(values[6]) * turned[t];
         l[t] = predicted[t] - origin[t] - values[3 + t];
     }
-    hat(l, K);
-    times(K, J, KJ);
-    for (int t = 0; t < 3; t++)
-        for (int j = 0; j < 3; j++) {
-            D[7 * t + j] = -KJ[3 * t + j];
-            D[7 * t + 3 + j] = t == j ? 1.0 : 0.0;
-            D[7 * t + 6] = l[t];
-        }
+    sensor_matrix(J, l, D);
 }
 
 /* e = R' (p - x) - y, J (k x q) = [-C, R', -D] by pose, landmark and sensors */
@@ -421,20 +394,10 @@ static void add_point(const Equations *eq, const Seen *seen, const Solution *at,
     add_block(eq->border_gradient + sensors, c_s, g + d + k, c_s, 1, c_s);
 }
 
-static int linearise(const Equations *eq, const Prior *prior, const Links *links, const Seen *seen,
-                     const Solution *at, const Weighing *weighing) {
+static double *work_for(const Equations *eq, const Prior *prior) {
     long N = prior->N, d = eq->d, q = 2 * d + eq->c;
-    long size = N * (N + d + 2) + eq->k * prior->m * d + d * d, other = q * (q + 2 * d + 1);
-    double *work = PyMem_RawMalloc((size_t)(size > other ? size : other) * sizeof(double));
-    if (work == NULL)
-        return 0;
-    add_prior(eq, prior, at, work);
-    for (long s = 0; s + 1 < eq->S; s++)
-        add_motion(eq, links, at, s, work);
-    for (long m = 0; m < eq->M; m++)
-        add_point(eq, seen, at, weighing, m, work);
-    PyMem_RawFree(work);
-    return 1;
+    long size = N * (2 * N + d + 2) + eq->k * prior->m * d + d * d, other = q * (q + 2 * d + 1);
+    return PyMem_Malloc((size_t)(size > other ? size : other) * sizeof(double));
 }
 
 /* ------------------------------------------------------ eliminate, fill_in: bordered_chain.py */
@@ -477,12 +440,6 @@ static void backward(const double *L, const double *links, const double *rows, c
     }
 }
 
-static void transposed(const double *M, long d, double *out) {
-    for (long i = 0; i < d; i++)
-        for (long j = 0; j < d; j++)
-            out[i * d + j] = M[j * d + i];
-}
-
 static long kept(const Chain *chain, long r) { /* which pose is number r of those kept */
     return r <= chain->J ? STRIDE * r : r + INNER * chain->J;
 }
@@ -491,45 +448,29 @@ static long kept(const Chain *chain, long r) { /* which pose is number r of thos
  * those columns of the border which they saw; ``columns`` has these, last that of the gradient. */
 typedef struct {
     double *T, *links, *rows, *ends, *lost;
-    long *columns, *slots, *begins, width;
+    i64 *columns, *slots, *begins;
+    long width;
 } Stretch;
 
-typedef struct {
-    size_t numbers, integers;
-} Room;
-
-/* Lay the arrays of a stretch out in memory, or count what they take. */
-static Room lay_out(const Equations *eq, const Chain *chain, double *memory, long *integers,
-                    Stretch *stretch) {
-    Room used = {0, 0};
-    long d = eq->d, most = 0;
-    for (long m = 0, first = 0; m < eq->M; m++) {
-        while (eq->poses[first] / STRIDE < eq->poses[m] / STRIDE)
-            first++;
-        most = m + 1 - first > most ? m + 1 - first : most;
+/* Lay the arrays of a stretch out in one piece of memory, ``T``, all members of which have 8
+ * bytes; it is NULL where there is none. A stretch sees no more than all of the border. */
+static double *lay_out(const Equations *eq, const Chain *chain, Stretch *stretch) {
+    long d = eq->d, size = INNER * d * d, width = 2 * d + (chain->J ? eq->b : eq->c) + 1;
+    long count = 2 * size + (INNER * d + 3) * width + d * d + eq->n + eq->S + 1;
+    stretch->T = PyMem_Malloc((size_t)count * sizeof(double));
+    if (stretch->T == NULL)
+        return NULL;
+    stretch->links = stretch->T + size, stretch->rows = stretch->links + size;
+    stretch->ends = stretch->rows + INNER * d * width, stretch->lost = stretch->ends + width;
+    stretch->columns = (i64 *)(stretch->lost + width + d * d);
+    stretch->slots = stretch->columns + width, stretch->begins = stretch->slots + eq->n;
+    memset(stretch->slots, -1, (size_t)eq->n * sizeof(i64));
+    for (long s = 0, m = 0; s <= eq->S; s++) {
+        while (m < eq->M && eq->poses[m] < s)
+            m++;
+        stretch->begins[s] = m;
     }
-    long width = 2 * d + eq->c + eq->k * (chain->J ? most : 0) + 1;
-#define TAKE(field, memory, used, count) \
-    (stretch->field = memory ? memory + used : NULL, used += (size_t)(count))
-    TAKE(T, memory, used.numbers, INNER * d * d);
-    TAKE(links, memory, used.numbers, INNER * d * d);
-    TAKE(rows, memory, used.numbers, INNER * d * width);
-    TAKE(ends, memory, used.numbers, width);
-    TAKE(lost, memory, used.numbers, width > d * d ? width : d * d);
-    TAKE(columns, integers, used.integers, width);
-    TAKE(slots, integers, used.integers, eq->n);
-    TAKE(begins, integers, used.integers, eq->S + 1);
-#undef TAKE
-    if (memory != NULL) {
-        for (long i = 0; i < eq->n; i++)
-            stretch->slots[i] = -1;
-        for (long s = 0, m = 0; s <= eq->S; s++) {
-            while (m < eq->M && eq->poses[m] < s)
-                m++;
-            stretch->begins[s] = m;
-        }
-    }
-    return used;
+    return stretch->T;
 }
 
 /* Take up stretch j and eliminate its poses; 0 where their T is not positive definite. */
@@ -571,7 +512,7 @@ static int eliminate_stretch(const Equations *eq, long j, Stretch *stretch) {
 /* Take from the chain and from the border, as the equations have it, what stretch j has of it. */
 static void subtract_stretch(const Equations *eq, const Chain *chain, long j, Stretch *stretch) {
     long d = eq->d, b = eq->b, width = stretch->width, gradient = width - 1;
-    const long *columns = stretch->columns;
+    const i64 *columns = stretch->columns;
     double *lost = stretch->lost;
     for (long l = 0; l < gradient; l++) {
         memset(lost, 0, (size_t)width * sizeof(double));
@@ -601,7 +542,7 @@ static void subtract_stretch(const Equations *eq, const Chain *chain, long j, St
 }
 
 /* The poses that are kept, as the equations have them. */
-static void take_chain(const Equations *eq, const Chain *chain, const long *begins) {
+static void take_chain(const Equations *eq, const Chain *chain, const i64 *begins) {
     long d = eq->d, b = eq->b, width = chain->width, size = d * d;
     memset(chain->rows, 0, (size_t)(chain->R * d * width) * sizeof(double));
     memset(chain->links, 0, (size_t)((chain->R - 1) * size) * sizeof(double));
@@ -662,7 +603,6 @@ static PyObject *py_linearise(PyObject *Py_UNUSED(self), PyObject *const *args, 
     Seen seen;
     Solution at;
     Weighing weighing;
-    int has_memory = 1;
     open_door(&door);
     if (count != 6)
         refuse("linearise");
@@ -671,14 +611,23 @@ static PyObject *py_linearise(PyObject *Py_UNUSED(self), PyObject *const *args, 
              && read_seen(&door, args[3], &eq, &seen)
              && (door.sizes['n'] = eq.n, read_fields(&door, args[4], SOLUTION, &at, "Solution"))
              && read_fields(&door, args[5], WEIGHING, &weighing, "Weighing")
-             && read_axes(&eq, &weighing)) {
-        Py_BEGIN_ALLOW_THREADS
-        has_memory = linearise(&eq, &prior, &links, &seen, &at, &weighing);
-        Py_END_ALLOW_THREADS
+             && ((eq.d == (weighing.is_planar ? 3 : 6) && eq.k == (weighing.is_planar ? 2 : 3))
+                 || refuse("Weighing"))) {
+        double *work = work_for(&eq, &prior);
+        if (work == NULL)
+            PyErr_NoMemory();
+        else {
+            Py_BEGIN_ALLOW_THREADS
+            add_prior(&eq, &prior, &at, work);
+            for (long s = 0; s + 1 < eq.S; s++)
+                add_motion(&eq, &links, &at, s, work);
+            for (long m = 0; m < eq.M; m++)
+                add_point(&eq, &seen, &at, &weighing, m, work);
+            Py_END_ALLOW_THREADS
+        }
+        PyMem_Free(work);
     }
     close_door(&door);
-    if (!has_memory)
-        return PyErr_NoMemory();
     if (PyErr_Occurred())
         return NULL;
     Py_RETURN_NONE;
@@ -690,8 +639,7 @@ static PyObject *py_solve(PyObject *Py_UNUSED(self), PyObject *const *args, Py_s
     Equations eq;
     Chain chain;
     Stretch stretch;
-    double *border = NULL, *changes = NULL, *memory = NULL;
-    long *integers = NULL;
+    double *border = NULL, *changes = NULL;
     int is_regular = 0, fills_in = count > 2;
     open_door(&door);
     if (count != (fills_in ? 4 : 2))
@@ -699,37 +647,26 @@ static PyObject *py_solve(PyObject *Py_UNUSED(self), PyObject *const *args, Py_s
     else if (read_equations(&door, args[0], &eq) && read_chain(&door, args[1], &eq, &chain)
              && (!fills_in || ((border = read_array(&door, args[2], "dw", "border")) != NULL
                                && (changes = read_array(&door, args[3], "DSd", "changes"))))) {
-        Room room = lay_out(&eq, &chain, NULL, NULL, &stretch);
-        memory = PyMem_Malloc(room.numbers * sizeof(double));
-        integers = PyMem_Malloc(room.integers * sizeof(long));
-        if (memory == NULL || integers == NULL)
+        double *memory = lay_out(&eq, &chain, &stretch);
+        if (memory == NULL)
             PyErr_NoMemory();
         else {
-            lay_out(&eq, &chain, memory, integers, &stretch);
             Py_BEGIN_ALLOW_THREADS
             is_regular = fills_in ? fill_in(&eq, &chain, border, changes, &stretch)
                                   : eliminate(&eq, &chain, &stretch);
             Py_END_ALLOW_THREADS
         }
         PyMem_Free(memory);
-        PyMem_Free(integers);
     }
     close_door(&door);
     return PyErr_Occurred() ? NULL : PyBool_FromLong(is_regular);
 }
 
 static PyMethodDef methods[] = {
-    {"linearise", (PyCFunction)(void (*)(void))py_linearise, METH_FASTCALL, "Fill in equations."},
-    {"eliminate", (PyCFunction)(void (*)(void))py_solve, METH_FASTCALL, "Leave the border."},
-    {"fill_in", (PyCFunction)(void (*)(void))py_solve, METH_FASTCALL, "Find all changes."},
+    METHOD("linearise", py_linearise, "Fill in equations."),
+    METHOD("eliminate", py_solve, "Leave the border."),
+    METHOD("fill_in", py_solve, "Find all changes."),
     {NULL, NULL, 0, NULL},
 };
 
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, .m_name = "_gauss_newton", .m_doc = "Gauss-Newton in C.", .m_size = 0,
-    .m_methods = methods,
-};
-
-PyMODINIT_FUNC PyInit__gauss_newton(void) {
-    return make_module(&definition);
-}
+MODULE(_gauss_newton, "Gauss-Newton in C.")
