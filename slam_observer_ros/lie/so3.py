@@ -27,13 +27,9 @@ _HAT = np.array(
 _IDENTITY = np.eye(3)
 _THREE = 3.0 * _IDENTITY
 
-# Added to θ²: 0/0 becomes 0 / 1e-300, and any angle above 1e-142 rad keeps all its bits.
-_ZERO_GUARD = 1e-300
-
+_ZERO_GUARD = 1e-300  # added to θ²: any angle above 1e-142 rad keeps all its bits
 ROUNDING = 1e-12  # how far RᵀR may be from identity after many products
-
-# How far the norm of a quaternion that is a rotation may be from 1.
-QUATERNION_NORM_TOLERANCE = 0.1
+QUATERNION_NORM_TOLERANCE = 0.1  # how far from 1 the norm of a rotation's quaternion may be
 
 
 def hat(phi: FloatArray) -> FloatArray:

@@ -29,9 +29,7 @@ from slam_observer_ros.mapping.places import (
     Weighing,
 )
 
-# How often a point is looked for in the map, in all: that takes a second or less.
-MAX_LOOKS = 500_000
-
+MAX_LOOKS = 500_000  # how often a point is looked for in the map: in a second or less
 MAX_PLACES = 400  # places that are weighed, which takes a millisecond each
 AT_ONCE = 4096  # sets of landmarks that are looked at together. After them the search may be over
 

@@ -43,9 +43,7 @@ MAX_SOUGHT = 12  # landmarks by which places are searched for, those seen last
 MAX_WEIGHED = 60  # landmarks by which the places that were found are weighed
 MAX_FITTING = 50  # places that are weighed by all of these
 FEWEST_COMPARED = 2  # landmarks beyond those that fix a place by which ids and places are compared
-
-# How many times as often landmarks must have been seen before it is worth searching again.
-NEWS = 1.3
+NEWS = 1.3  # how many times as often landmarks must have been seen to be searched for again
 
 
 def warn_of_symmetry(loaded: LandmarkMap, name: str) -> None:

@@ -40,16 +40,13 @@ MOST_KEPT, MOST_FITTED = 32, 8
 FIRST_STEPS, STEPS, FITTING_STEPS = 5, 20, 10
 
 ONE = 0.03  # rad, and share of the map, within which two descents have ended at one minimum
-
-# By how many times the views have grown when it is searched again, and after how many at most.
-TRY_AGAIN, MOST_BETWEEN = 1.2, 10
+TRY_AGAIN, MOST_BETWEEN = 1.2, 10  # search again once views have grown by the factor or number
 
 # Share of the views that a pose explains, their χ² per view, and by how much more others have: the
 # odds are e^15 then.
 MOST, FITS, APART = 0.5, 2.5, 30.0
 
-# Standard deviations within which two minima are one, and a way on a line has no other side.
-SAME = 1.0
+SAME = 1.0  # standard deviations within which two minima are one, and a line has no sides
 
 # Largest standard deviations of the turn, rad, and of the place, as a share of the distances. With
 # three of them the error of the second order is a fiftieth, and the filter can start.

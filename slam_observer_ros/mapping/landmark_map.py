@@ -23,12 +23,8 @@ from slam_observer_ros.lie.matrices import (
 )
 from slam_observer_ros.models.point_noise import RESOLUTION_M
 
-# How far landmarks may be from each other that look the same from a place that looks the same.
-SAME_M = 0.2
-
-# Share of the landmarks that are where others are, in a map that looks the same when moved.
-SAME_SHARE = 0.9
-
+SAME_M = 0.2  # how far landmarks may be apart that look the same from places that look the same
+SAME_SHARE = 0.9  # of landmarks that are where others are, in a map that looks the same moved
 ROUNDED_M = 1e-3  # by how much positions differ that somebody wrote down in millimetres
 MAX_CORRELATED = 1000  # landmarks of a map up to which correlations are saved, in 46 MB then
 MAX_NUMBER = 1e12  # metres; nothing larger is meant seriously, and its square still has all digits
@@ -146,9 +142,7 @@ class LandmarkMap:
         ).moved(T)
 
 
-# Pairs of landmarks that are kept: all among 2000, in larger maps the close ones.
-MAX_PAIRS = 2_000_000
-
+MAX_PAIRS = 2_000_000  # pairs that are kept: all of 2000 landmarks, in larger maps the close ones
 MAX_TRIPLES = 1_000_000  # triangles that are looked at for one of three given sides
 
 # Which of three landmarks are 0, 1 and 2, found in this order: both ends of one side, that first

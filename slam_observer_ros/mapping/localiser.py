@@ -57,8 +57,7 @@ LIMIT = 8.0  # sum at which the robot is lost
 CONTRADICTED_TIMES, CONTRADICTED_NS = 3, 500_000_000
 
 
-# For how long a pose is doubted that landmarks contradict which are too few to find it.
-STRAYED_NS = 2_000_000_000
+STRAYED_NS = 2_000_000_000  # a pose is doubted that landmarks contradict, too few to find it
 
 
 class Localiser:

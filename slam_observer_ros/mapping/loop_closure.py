@@ -33,9 +33,7 @@ MAX_CANDIDATES = 10  # landmarks that another one may be: the likeliest, if ther
 LEAST_M = 0.01
 
 NEIGHBOURS = 4  # landmarks next to one that say how many there are about it
-
-# −ln of the probability below which it is no chance that a landmark in view is not seen.
-SHOULD_BE_SEEN = 3.0
+SHOULD_BE_SEEN = 3.0  # −ln of the probability below which it is no chance to miss a landmark
 
 
 class LoopClosure:

@@ -164,8 +164,7 @@ def likeness_by_ids(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
     return None
 
 
-# Landmarks that show that two maps are one place: of two alone only the distance has to fit.
-LEAST_SAME = 3
+LEAST_SAME = 3  # landmarks that show that maps are one: of two alone only a distance has to fit
 
 
 class AlikeMaps:

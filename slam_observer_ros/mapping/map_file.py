@@ -73,8 +73,7 @@ FORMAT_VERSION = 1
 
 _MAX_INT64 = 2**63 - 1
 
-# By how much the norm of a quaternion that somebody wrote down may miss being one.
-_ROUNDED_NORM = 1e-2
+_ROUNDED_NORM = 1e-2  # by how much the norm of a quaternion written by hand may be off
 
 _COUNTED = ('id', 'position', 'sigma', 'covariance', 'orientation', 'orientation_sigma')
 
@@ -82,8 +81,7 @@ _OPTIONAL = ('sigma', 'covariance', 'observations', 'orientation', 'orientation_
 
 _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
-# Largest file that is read: two hundred thousand landmarks with covariances.
-MAX_BYTES = 70_000_000
+MAX_BYTES = 70_000_000  # the largest file: two hundred thousand landmarks with covariances
 
 # Decimal numbers alone: by YAML 1.1, 010 is 8 and 1:30 is 90.
 _INT = re.compile(r'[-+]?(?:0|[1-9][0-9]*)')

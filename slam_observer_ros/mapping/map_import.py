@@ -355,8 +355,7 @@ def _field_rows(content: Any) -> list[Row]:
     return rows
 
 
-# Of a table without a header, in this order; z and sigma may be left out.
-COLUMNS = ('id', 'x', 'y', 'z', 'sigma')
+COLUMNS = ('id', 'x', 'y', 'z', 'sigma')  # without a header; z and sigma may be left out
 
 QUATERNION = ('qx', 'qy', 'qz', 'qw')
 
@@ -371,8 +370,7 @@ OTHER_NAMES = {
     **{f'{before}{axis}': axis for before in ('t', 'pos_', 'position_') for axis in 'xyz'},
 }
 
-# Columns of numbers that a map does without; others may be of a kind that changes it.
-IGNORED = ('size', 'tag_size', 'observations')
+IGNORED = ('size', 'tag_size', 'observations')  # columns of numbers that change no map
 
 UNITS = {'': 1.0, 'm': 1.0, 'rad': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'deg': np.pi / 180.0}
 UNITS['°'] = UNITS['deg']

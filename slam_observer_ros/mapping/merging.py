@@ -27,11 +27,8 @@ from slam_observer_ros.mapping.landmark_map import LandmarkMap, MAX_CORRELATED
 from slam_observer_ros.mapping.map_alignment import find_transform
 from slam_observer_ros.tracking.state import State
 
-# Least variance that is distinguished from zero, as a share of the sum of all variances.
-ROUNDING = 1e-14
-
-# Share of its largest singular value below which G has none: few landmarks leave turns open.
-RANK_TOLERANCE = 1e-8
+ROUNDING = 1e-14  # least variance distinguished from zero, as a share of the sum of all
+RANK_TOLERANCE = 1e-8  # share of G's largest singular value: few landmarks leave turns open
 
 
 def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
@@ -183,8 +180,7 @@ def _in_reference_frame(state: State, known: LandmarkMap) -> KnownLandmarks:
     return known.landmarks_in(back, state.settings.map_noise)
 
 
-# Speed from which on a landmark is left out of a map, m/s; slower ones may be at rest.
-MOVING_SPEED = 0.1
+MOVING_SPEED = 0.1  # m/s from which on a landmark is left out of a map; slower ones may be at rest
 
 
 def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:

@@ -34,9 +34,7 @@ from slam_observer_ros.mapping.landmark_map import MappedLandmarks
 GATE = 3.7  # standard deviations that a point may be off
 MAX_ROUNDS = 4  # how often a place is fitted to its matches, and matched again
 RIVALS = 4  # landmarks near a point among which the most likely one is taken
-
-# By how much variances may turn out larger than stated: real noise is not white.
-MAX_VARIANCE_FACTOR = 4.0
+MAX_VARIANCE_FACTOR = 4.0  # variances may turn out larger than stated: real noise is not white
 
 # Parameters of the beta distribution of f: one point in five is of no landmark, or none, or most
 # of them.

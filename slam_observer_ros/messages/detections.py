@@ -31,8 +31,7 @@ POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 DETECTIONS = 'vision_msgs/msg/Detection3DArray'
 BOXES = 'vision_msgs/msg/Detection2DArray'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
-# Types that have pixels, which are directions where the camera's CameraInfo is known.
-IN_IMAGES = (APRILTAGS, BOXES)
+IN_IMAGES = (APRILTAGS, BOXES)  # types of pixels: directions by the camera's CameraInfo
 
 _POSE = 7
 _COVARIANCE = 36

@@ -144,11 +144,8 @@ def _usable(ids: IntArray) -> IntArray:
     return np.where((ids >= 0) & (ids <= MAX_ID), ids, UNKNOWN_ID)
 
 
-# Names have the ids from here on, so that none is a number that people give landmarks.
-FIRST_NAMED_ID = 2**31
-
-# Most names in a run: more are ids that change from message to message, as of a tracker.
-MAX_NAMES = 10_000
+FIRST_NAMED_ID = 2**31  # names have ids from here on: people give landmarks smaller numbers
+MAX_NAMES = 10_000  # names in a run: more are ids that change with each message, as of a tracker
 
 
 class LandmarkNames:

@@ -27,9 +27,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 MOVES = 6  # column of b in [M b] (6, 7), which is multiplied by 1 where a velocity is not zero
-
-# Where τ is behind [M b], row by row, and behind it ``EACH`` values of each sensor.
-DELAY, SENSORS, EACH = 42, 43, 7
+DELAY, SENSORS, EACH = 42, 43, 7  # where τ is behind [M b], and, behind it, values of each sensor
 
 # Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier. How
 # the robot moves so much later is not known yet when it is needed: without a limit the estimate,

@@ -47,9 +47,7 @@ MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
 # only drown all else that is known in rounding.
 MAX_GAP_ERRORS = np.repeat([np.pi, 1000.0], 3)
 
-# Time over which a velocity is averaged, as its error may be in proportion to it.
-SPEED_WINDOW_S = 1.0
-
+SPEED_WINDOW_S = 1.0  # a velocity is averaged over it, as its error may be in proportion to it
 MEMORY = 300  # observations over which the factors are found: they follow a change of the ground
 MAX_STEP = 0.5  # change of ln ρ by one observation, at most
 
@@ -66,8 +64,7 @@ KINDS = {'turning': 'angular', 'driving': 'linear'}
 
 _IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
 
-# Of the logarithm of a factor of the standard deviation at the start: half as for θ.
-PRIOR_DEVIATION = 0.5
+PRIOR_DEVIATION = 0.5  # of ln of a factor of the standard deviation at the start: half as for θ
 
 
 class MotionFigures(NamedTuple):

@@ -24,9 +24,7 @@ from slam_observer_ros.models.point_noise import (
 from slam_observer_ros.settings.estimator_settings import Settings
 
 RESOLUTION_RAD = 1e-4  # least standard deviation of an orientation about each axis
-
-# For which share of the time that a robot has stood its sensor's error is taken to last.
-LASTING = 0.1
+LASTING = 0.1  # share of the time a robot has stood for which its sensor's error is taken to last
 
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
@@ -112,10 +110,7 @@ class ObservationNoise:
 
 _CORNERS = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 LEAST_RANGE = 1.0  # range, in edges of the tag, nearer than which no camera has all of it in view
-
-# Range, in edges of the tag, beyond which its corners are one point but for rounding.
-LARGEST_RANGE = 1e6
-
+LARGEST_RANGE = 1e6  # in edges of the tag: beyond, its corners are one point but for rounding
 LEAST_NOISE = 1e-6  # noise of corners, in focal lengths, beside which less is lost in rounding
 
 

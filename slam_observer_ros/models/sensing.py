@@ -117,9 +117,7 @@ MOST_UNCOMPARED = 64  # observations whose ranges are compared at once
 # Least number of points that says something, and the parts of them that scatter.
 MIN_POINTS, PARTS = 200, 20
 
-# Standard deviation of ln cos b from which it does: half a field of view of some 25°.
-MIN_SPREAD = 0.02
-
+MIN_SPREAD = 0.02  # least standard deviation of ln cos b: half a field of view of some 25°
 MAX_BEHIND = 0.1  # share of the points beside or behind the sensor beyond which it sees all around
 MAX_ERROR = 1.0  # error of ln range beyond which a point is no measurement of its landmark
 

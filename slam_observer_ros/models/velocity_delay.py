@@ -27,8 +27,7 @@ from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.models.calibration import Calibration
 from slam_observer_ros.models.velocity_history import VelocityHistory
 
-# Standard deviation over the median of the absolute value, of normal distributions.
-_PER_MEDIAN = 1.4826
+_PER_MEDIAN = 1.4826  # standard deviation over the median absolute value, of normal ones
 
 
 SAMPLED = 3  # one of so many motions is looked at: only ratios of sums count, and time

@@ -21,15 +21,13 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.models.held_velocities import held, HeldVelocities, Velocities
 
-# Stamp of a velocity that timed out before time began, nanoseconds.
-NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
+NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND  # before time began
 
 # The last 16 times 64 periods show how long messages of a sensor are in force as a rule. So many
 # that they have pauses in them where these are usual, as of commands.
 BLOCK, BLOCKS = 64, 16
 
-# Periods that show how often messages come: a pause or two among them change nothing.
-FEWEST_PERIODS = 5
+FEWEST_PERIODS = 5  # periods that show how often messages come: a pause or two change nothing
 
 # How long a velocity must have been exactly zero before the robot stands, nanoseconds. Commands
 # are ahead of the robot by their delay, and it coasts; both take less than that.

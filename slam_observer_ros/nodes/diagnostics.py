@@ -104,12 +104,8 @@ class LocalisationStatus:
 
 
 WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000  # time, and events, of late that are looked at
-
-# Driving that says something; the most that a search may then take is left of a minute.
-LEAST_DRIVEN_S = 20.0
-
-# How often a search goes on, and for how long, so that no message waits for it.
-PERIOD_S, SLICE_S = 0.03, 0.01
+LEAST_DRIVEN_S = 20.0  # seconds of driving that say something: a minute leaves time to search them
+PERIOD_S, SLICE_S = 0.03, 0.01  # how often a search goes on, and how long: no message waits for it
 
 # Time between the starts of two searches, at most: before, most of the events are the same. Where
 # less was driven than in that time, new events are as many as old ones sooner.

@@ -81,8 +81,7 @@ TOPICS = (
     'markers',
 )
 
-# Odometry on /tf may be post-dated a little, so that it holds until the next one.
-MAX_AHEAD_S = 0.25
+MAX_AHEAD_S = 0.25  # odometry on /tf may be post-dated a little, so that it holds until the next
 
 
 class EstimatePublisher:

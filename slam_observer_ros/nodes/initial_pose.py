@@ -161,9 +161,7 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
 # stood for longer may have been pushed.
 MAX_AGE_S = 600.0
 
-# Speed beyond which a robot indoors does not drive: its odometry then is another.
-FAST_M_PER_S = 3.0
-
+FAST_M_PER_S = 3.0  # no robot indoors drives faster: its odometry then is another
 AT_START_M, AT_START_RAD = 0.1, 0.1  # how far from its origin an odometry is that has just begun
 
 
@@ -273,7 +271,6 @@ def _is_at_start(odometry: FloatArray) -> bool:
 
 FORMAT = 'slam_observer_ros pose'
 MAX_BYTES = 10_000
-SIZES = {'position': 3, 'orientation': 4, 'covariance': 36}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,14 +309,14 @@ def write_pose(path: Path, stored: StoredPose) -> None:
 def read_pose(path: Path) -> StoredPose:
     """Read the file; MapError if it can't be read, or is no such file."""
     try:
-        content = load_yaml(path, MAX_BYTES, plain_value)
-    except OSError as error:
-        raise MapError(f"can't read the pose {path}: {error.strerror}") from error
+        with failing(MapError, f"can't read the pose {path}"):
+            content = load_yaml(path, MAX_BYTES, plain_value)
     except YamlError as error:
         raise MapError(f'the pose {path} is not valid YAML: {error}') from error
     if not isinstance(content, dict) or content.get('format') != FORMAT:
         raise MapError(f"{path} has no line 'format: {FORMAT}'")
-    values = {name: _numbers(path, content, name, size) for name, size in SIZES.items()}
+    sizes = {'position': 3, 'orientation': 4, 'covariance': 36}
+    values = {name: _numbers(path, content, name, size) for name, size in sizes.items()}
     (time_s,) = _numbers(path, {'time': [content.get('time')]}, 'time', 1)
     odometry = None
     if 'odometry' in content:

@@ -29,9 +29,7 @@ from slam_observer_ros.settings.node_settings import (
 )
 
 DISCOVERY_S = 1.0  # time after which publishers have been found, unless an announcement was lost
-
-# How often those are looked for whose announcement comes later: DDS repeats it after 3 s.
-LOOK_PERIOD_S = 0.25
+LOOK_PERIOD_S = 0.25  # for publishers that are announced later: DDS repeats it after 3 s
 
 # By what is read: the node's topic for it, and what has to be set.
 INPUTS: dict[Role, tuple[str, str]] = {

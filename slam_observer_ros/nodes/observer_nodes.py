@@ -52,8 +52,7 @@ from slam_observer_ros.settings.parameter_table import changed_names, Dataclass,
 
 RETRY_PERIOD_S = 0.02
 
-# Inputs that are cheap to use, and move the estimate on to the present.
-MOTION_INPUTS = ('twist', 'imu')
+MOTION_INPUTS = ('twist', 'imu')  # they are cheap to use, and move the estimate on to the present
 
 
 class DataFlow:
@@ -181,8 +180,7 @@ DIAGNOSTICS_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
 KEEP_PERIOD_S = 2.0
 
-# /clock may step back by less without having jumped, nanoseconds: messages are then just late.
-CLOCK_JITTER_NS = 100_000_000
+CLOCK_JITTER_NS = 100_000_000  # a /clock that steps back by less has not jumped: messages are late
 
 
 class ObserverCore:
@@ -322,8 +320,7 @@ class ObserverCore:
 
 
 TOPIC = 'bond'
-# After which without a heartbeat the manager is given up; as Nav2's own nodes have it.
-TIMEOUT_S = 4.0
+TIMEOUT_S = 4.0  # without a heartbeat after which the manager is given up, as in Nav2's nodes
 
 
 class LifecycleBond:

@@ -40,9 +40,7 @@ of a running node `ros2 param list` does.
 """
 
 STOP_LATENCY_S = 0.1  # longest time that an idle node takes to notice a signal
-
-# How long a node may take to end by itself, as within a long computation; launch waits 5 s.
-PATIENCE_S = 1.2
+PATIENCE_S = 1.2  # how long a node may take to end, as within a long computation; launch waits 5 s
 
 
 def run(

@@ -35,8 +35,7 @@ from slam_observer_ros.nodes.ros_node import RELIABLE_QOS
 from slam_observer_ros.nodes.transforms import TransformedOdometry
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
-# Time between two velocities, nanoseconds, whose stamps are believed at once.
-MAX_STEP_NS = 500_000_000
+MAX_STEP_NS = 500_000_000  # time between two velocities whose stamps are believed at once
 
 
 class PausedMotion:
@@ -149,9 +148,7 @@ class ControlServices:
         self._node.get_logger().info(f'landmark {message.data} is {outcome}')
 
 
-# How many times as long as it took the map at hand is kept before it is made again.
-RECENT_PERIODS = 20.0
-
+RECENT_PERIODS = 20.0  # the map at hand is kept for as many times as long as it took to make
 END_S = 0.2  # for how long, at the end, events that are held back are begun with
 
 

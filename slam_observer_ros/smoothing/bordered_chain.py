@@ -30,8 +30,7 @@ COMPILED = compiled('smoothing._gauss_newton')
 
 STRIDE = 8
 
-# Size of a border which, carried along the whole chain, costs less than a detour.
-SMALL_BORDER = 100
+SMALL_BORDER = 100  # less to carry along the whole chain than a detour costs
 
 
 class Equations(NamedTuple):

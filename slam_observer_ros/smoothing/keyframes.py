@@ -204,8 +204,7 @@ def joined_turns(parts: list[SeenTurns], counts: list[int]) -> SeenTurns:
     )
 
 
-# Times, at most, that it is asked which slips pay; the answer hardly changes after the third.
-ROUNDS = 10
+ROUNDS = 10  # of asking which slips pay; the answer hardly changes after the third
 
 
 def confirmed_slips(

@@ -52,12 +52,8 @@ logger = logging.getLogger(__name__)
 SHARE_OF_HISTORY = 0.1
 
 MAX_INTERVAL = 300  # observations that are enough, however many there were before
-
-# Keyframes that are kept for landmarks that may enter: as many cost some milliseconds.
-MOST_AWAITED = 1000
-
-# Most unknowns of a map that is relinearised, in some tenths of a second: 100 tags in space.
-MAX_UNKNOWNS = 600
+MOST_AWAITED = 1000  # keyframes kept for landmarks that may enter: they cost some milliseconds
+MAX_UNKNOWNS = 600  # of a map that is relinearised, in some tenths of a second: 100 tags in space
 
 NO_HISTORY = "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
 
@@ -72,12 +68,8 @@ EARLY_SHARE = 0.1
 # Steps at most; change of pose and map, rad and m, below which one will do.
 ITERATIONS, TOLERANCE = 2, 2e-2
 
-# Steps at most where a landmark enters, by which all since it was seen first is corrected.
-ENTRY_ITERATIONS = 10
-
-# Steps at most to see where a landmark is, and by how much one has to be better at least.
-PLACING_ITERATIONS, COST_TOLERANCE = 40, 0.1
-
+ENTRY_ITERATIONS = 10  # at most where a landmark enters, which corrects all since it was seen
+PLACING_ITERATIONS, COST_TOLERANCE = 40, 0.1  # steps to place a landmark; least gain of one
 SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6  # the same for smoothing everything
 SLIP_TOLERANCE = 1e-4  # change below which a solution will do to judge slips by
 
