@@ -228,8 +228,6 @@ Queued: TypeAlias = MeasuredVelocity | ObservationEvent
 
 def flatten(event: ObservationEvent) -> ObservationEvent:
     """Return the observation in the plane z = 0; lines of sight stay."""
-    if event.velocities is None and not np.count_nonzero(event.points[:, 2]):
-        return event
     points = event.points * _PLANAR_POINT
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
     sensor = points - event.lines_of_sight if event.points[:, 2].any() else event.sensor

@@ -89,7 +89,16 @@ def check_event(event: Event, settings: Settings) -> None:
             _check_orientations(event)
     else:
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
-    _check_times(event.stamp_ns, event.receive_ns)
+    stamp_ns, receive_ns = event.stamp_ns, event.receive_ns
+    if not isinstance(stamp_ns, _INTEGERS):
+        reason = f'stamp {stamp_ns!r} is no int or np.int64: stamps are in nanoseconds'
+        raise InvalidEventError('wrong_type', reason)
+    if stamp_ns < 0:
+        raise InvalidEventError('negative_stamp', f'stamp {stamp_ns} ns is negative')
+    if stamp_ns > MAX_STAMP_NS:
+        raise InvalidEventError('too_large', f'stamp {stamp_ns} ns is beyond 64 bits')
+    if receive_ns is not None and not isinstance(receive_ns, _INTEGERS):
+        raise InvalidEventError('wrong_type', f'receive_ns {receive_ns!r} is no int or np.int64')
 
 
 def are_finite(event: ObservationEvent) -> BoolArray | None:
@@ -103,14 +112,6 @@ def are_finite(event: ObservationEvent) -> BoolArray | None:
             return None
         fit &= np.isfinite(array).reshape(m, -1).all(axis=1)
     return fit if fit.any() else None
-
-
-def are_vague(event: ObservationEvent) -> BoolArray:
-    """Return which points (m,) are stated to be anywhere within MAX_DEVIATION."""
-    if event.covariances is None:
-        return np.zeros(len(event.ids), dtype=np.bool_)
-    variances = np.diagonal(event.covariances, axis1=1, axis2=2)
-    return np.asarray(variances.min(axis=1) >= MAX_DEVIATION**2)
 
 
 def check_velocities(velocities: VelocityBlock) -> None:
@@ -209,18 +210,6 @@ def _check_joint(landmark_map: LandmarkMap) -> None:
         check_joint(joint, covariances)
     except MapError as error:
         raise MapError(f'joint map covariance: {error}') from error
-
-
-def _check_times(stamp_ns: int, receive_ns: int | None) -> None:
-    if not isinstance(stamp_ns, _INTEGERS):
-        reason = f'stamp {stamp_ns!r} is no int or np.int64: stamps are in nanoseconds'
-        raise InvalidEventError('wrong_type', reason)
-    if stamp_ns < 0:
-        raise InvalidEventError('negative_stamp', f'stamp {stamp_ns} ns is negative')
-    if stamp_ns > MAX_STAMP_NS:
-        raise InvalidEventError('too_large', f'stamp {stamp_ns} ns is beyond 64 bits')
-    if receive_ns is not None and not isinstance(receive_ns, _INTEGERS):
-        raise InvalidEventError('wrong_type', f'receive_ns {receive_ns!r} is no int or np.int64')
 
 
 def _is_usual(event: VelocityEvent) -> bool:
@@ -362,15 +351,19 @@ def usable_points(
 ) -> ObservationEvent:
     """Return an observation as the states use it; count its points, warn of those left out."""
     counts['observed_point'] += len(event.ids)
-    event = flatten(event) if settings.two_d_mode else event
+    if settings.two_d_mode and (event.velocities is not None or event.points[:, 2].any()):
+        event = flatten(event)
     if event.orientations is not None:
         used = None if gains.tags is None else so3.exact(event.orientations)
         event = replace(event, orientations=used)
     if gains.observer.is_exact and event.velocities is not None:
         event = replace(event, velocities=None)  # its landmarks are at rest
-    if vague := np.count_nonzero(are_vague(event)):
-        counts['vague_point'] += vague
-        warnings.warn('vague_point', count=vague, limit_m=MAX_DEVIATION)
+    if event.covariances is not None:
+        # Stated to be anywhere within MAX_DEVIATION.
+        least = np.diagonal(event.covariances, axis1=1, axis2=2).min(axis=1)
+        if vague := np.count_nonzero(least >= MAX_DEVIATION**2):
+            counts['vague_point'] += vague
+            warnings.warn('vague_point', count=vague, limit_m=MAX_DEVIATION)
     ids = event.ids.tolist()
     are_usual = 0 < len(set(ids)) == len(ids) <= settings.max_points
     if are_usual and min(ids) >= 0 and max(ids) < FIRST_AUTOMATIC_ID:

@@ -361,7 +361,8 @@ class Estimator(Estimate):
             update = with_kinds(update, event)
             if self._half_points.remember(self._hypotheses.states):
                 update = replace(update, pose=self._state.observer.pose)
-        self._timeline.judge_standing(event, update)
+        if np.count_nonzero(update.rejected):
+            self._timeline.judge_standing(event, update)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
         may_have_moved = self._follow_up(event, update)
@@ -460,14 +461,13 @@ class Estimator(Estimate):
             warnings.warn('more_than_max', count=len(event.ids), limit=limit)
         if len(update.moved_ids):
             warnings.moved_landmarks(update.moved_ids, event.stamp_ns)
-        if carried_ids := self._hypotheses.carried_ids:
+        if carried_ids := self._hypotheses.standing.carried:
             warnings.carried_landmarks(carried_ids)
         counts = self._hypotheses.some_counts((*UNEXPECTED_POSES, 'carried_landmark'))
-        warnings.unexpected_poses(counts[:-1])
+        warnings.of_state(counts[:-1], len(state.landmarks.ids), limit, state.gains)
         signs = [*counts, self._localiser.counts['lost']]
         if self._undisturbed.is_due(event.stamp_ns, signs):
             self._look(event.stamp_ns)
-        warnings.large_map(len(state.landmarks.ids), limit, state.gains)
 
     def _look(self, stamp_ns: int) -> None:
         """Look at what was learnt of the odometry, now and then."""

@@ -164,8 +164,11 @@ class EventQueue:
             before_ns, stamp_ns = event.stamps_ns[-2:].tolist()
         if event.receive_ns is not None:
             self._reception.note(event)
-        self._window.note(stamp_ns, before_ns)
-        self._is_newest_of_kind(event, stamp_ns)
+        window, newest_of_kind = self._window, self._newest_of_kind_ns
+        if window.late or window.length_ns or stamp_ns < before_ns:
+            window.note(stamp_ns, before_ns)
+        if stamp_ns > newest_of_kind.get(event.kind, -1):
+            newest_of_kind[event.kind] = stamp_ns
         if self._strays.last_ns is not None:
             self._strays.clear()
         self._believe(stamp_ns if stamp_ns > before_ns else before_ns, before_ns)
@@ -220,21 +223,19 @@ class _Window:
     def __init__(self, longest_ns: int) -> None:
         self._longest_ns = longest_ns
         self._begin_ns: int | None = None
-        self._late: deque[tuple[int, int]] = deque()  # when, and by how much: ever less
+        self.late: deque[tuple[int, int]] = deque()  # when, and by how much: ever less
         self.length_ns = longest_ns
 
     def note(self, stamp_ns: int, newest_ns: int) -> None:
         """Take the stamp of an event, and the newest one of those before it, nanoseconds."""
         if self._begin_ns is None:
             self._begin_ns = newest_ns
-        late = self._late
+        late = self.late
         if stamp_ns < newest_ns:
             late_ns = newest_ns - stamp_ns
             while late and late[-1][1] <= late_ns:
                 late.pop()
             late.append((newest_ns, late_ns))
-        elif not (late or self.length_ns):
-            return  # as nearly always
         oldest_ns = newest_ns - LATENESS_NS
         while late and late[0][0] < oldest_ns:
             late.popleft()

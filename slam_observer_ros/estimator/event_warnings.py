@@ -62,13 +62,6 @@ class EventWarnings:
         if str(count).rstrip('0') == '1':
             logger.warning('%s', found(kind, **figures).text(f' ({count} so far)'))
 
-    def large_map(self, count: int, limit: int, gains: Gains) -> None:
-        """Say once that a map is full, with 0 < ``limit``, and that its ``gains`` take long."""
-        if 0 < limit <= count:
-            self._warn_once('full_map', count=count, limit=limit)
-        if count >= MANY_LANDMARKS and gains.takes_all:
-            self._warn_once('large_map', count=count)
-
     def loaded_map(self, count: int, limit: int) -> None:
         """Say that a loaded map, to which new landmarks are added, will not be kept whole."""
         if 0 < limit < count:
@@ -91,13 +84,21 @@ class EventWarnings:
             logger.warning('%s', found('carried_landmark', ids=listed(sorted(ids))).text())
         self._reported['carried_landmark'] = len(ids)
 
-    def unexpected_poses(self, counts: Sequence[int]) -> None:
-        """Warn that the robot is not where it was taken to be, if one of these has grown."""
+    def of_state(self, counts: Sequence[int], landmarks: int, limit: int, gains: Gains) -> None:
+        """Warn that the robot is not where it was taken to be, if one of ``counts`` has grown.
+
+        Say once that a map of ``landmarks`` is full, with 0 < ``limit``, and that its ``gains``
+        take long.
+        """
         for name, count in zip(UNEXPECTED_POSES, counts, strict=True):
             if count > self._reported.get(name, 0):
                 self.warn(name)
                 self._reported[name] = count
                 self.two_places.doubt(is_all=True)
+        if 0 < limit <= landmarks:
+            self._warn_once('full_map', count=landmarks, limit=limit)
+        if landmarks >= MANY_LANDMARKS and gains.takes_all:
+            self._warn_once('large_map', count=landmarks)
 
     def unused_settings(self, settings: Settings, gains: Gains) -> None:
         """Name settings that have been changed and have no effect."""

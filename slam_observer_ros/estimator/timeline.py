@@ -172,7 +172,7 @@ class Timeline:
 
         Far as the farthest point is seen: points without ids have other ids in ``update``.
         """
-        if not len(update.rejected) or not update.rejected.all():
+        if not update.rejected.all():
             return
         farthest = event.points[np.argmax(np.linalg.norm(event.points, axis=1))][None]
         if beyond_driving(farthest, update.residuals, self._settings).all():

@@ -189,15 +189,16 @@ class Gains(ABC):
 
     def advance(self, velocities: Velocities, interval: Interval) -> Advanced:
         """Move pose and landmarks along velocities (27); return what that did."""
-        duration_s = to_s(interval.end_ns - interval.start_ns)
+        joint = self.joint
         if self.observer.have_moved:  # else this would cost O(n) at every step
+            duration_s = to_s(interval.end_ns - interval.start_ns)
             self.observer.a += self.observer.u * duration_s  # (27) has zero, here they move (19)
-        if self.joint is not None:
-            self.joint.note_motion(duration_s)
+        if joint is not None and (joint.chart.velocity or not joint.is_dense):
+            joint.note_motion(to_s(interval.end_ns - interval.start_ns))
         x, out = self.flat(), self._room_for_motion()
         status = core.advance(x, velocities, interval, self.motion_noise.figures, out)
         x.A[...] = out.A
-        if self.joint is not None:
+        if joint is not None:
             shares = np.array([out.of_turning, out.noise - out.of_turning])
             self.motion_noise.factors.move(None if status == step.AT_REST else shares)
         return out

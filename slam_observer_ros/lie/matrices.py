@@ -224,8 +224,18 @@ def are_covariances(matrices: FloatArray) -> BoolArray:
 
     Each entry is judged in its own standard deviations: a large variance hides no wrong one.
     """
-    if _have_roots(matrices):  # as nearly always, at a fifth of the cost
-        return np.ones(matrices.shape[:-2], dtype=np.bool_)
+    # Nearly all have a Cholesky factor, but for exact entries: that costs a fifth.
+    exact, rooted = matrices.diagonal(axis1=-2, axis2=-1) == 0.0, matrices
+    is_other = False
+    if np.count_nonzero(exact):
+        is_other = bool(matrices[exact].any() or transpose(matrices)[exact].any())
+        rooted = matrices + exact[..., None] * np.eye(exact.shape[-1])
+    least = rooted.diagonal(axis1=-2, axis2=-1).min(initial=1.0)
+    with np.errstate(over='ignore'), suppress(np.linalg.LinAlgError):
+        skew = np.abs(matrices - matrices.swapaxes(-1, -2)).max(initial=0.0)
+        if skew <= COVARIANCE_ROUNDING * least and not is_other:
+            np.linalg.cholesky(rooted)
+            return np.ones(matrices.shape[:-2], dtype=np.bool_)
     largest = np.full(matrices.shape[-1], MAX_DEVIATION)
     with np.errstate(over='ignore'):
         scaled = in_own_deviations(limited(matrices, largest), LEAST_SHARE)
@@ -235,24 +245,6 @@ def are_covariances(matrices: FloatArray) -> BoolArray:
     least = np.linalg.eigvalsh(scaled)[..., 0]
     fit: BoolArray = are_small & (skew <= COVARIANCE_ROUNDING) & (least >= -COVARIANCE_ROUNDING)
     return fit
-
-
-def _have_roots(covariances: FloatArray) -> bool:
-    """Return whether all covariances (…, d, d) have a Cholesky factor, but for exact entries."""
-    exact = covariances.diagonal(axis1=-2, axis2=-1) == 0.0
-    if np.count_nonzero(exact):
-        if covariances[exact].any() or transpose(covariances)[exact].any():
-            return False
-        covariances = covariances + exact[..., None] * np.eye(exact.shape[-1])
-    least = covariances.diagonal(axis1=-2, axis2=-1).min(initial=1.0)
-    with np.errstate(over='ignore'):
-        skew = np.abs(covariances - transpose(covariances)).max(initial=0.0)
-    if skew > COVARIANCE_ROUNDING * least:
-        return False
-    with suppress(np.linalg.LinAlgError):
-        np.linalg.cholesky(covariances)
-        return True
-    return False
 
 
 def in_own_deviations(matrices: FloatArray, least_share: float = 0.0) -> FloatArray:

@@ -42,8 +42,11 @@ def from_rpy(values: tuple[float, ...]) -> FloatArray:
 
 def inverse(T: FloatArray) -> FloatArray:
     """Return T⁻¹ = [[Rᵀ, −Rᵀ x], [0, 1]]."""
-    R_transposed = T[..., :3, :3].swapaxes(-1, -2)
-    return pose(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
+    R_transposed, inverted = T[..., :3, :3].swapaxes(-1, -2), np.zeros(T.shape)
+    inverted[..., :3, :3] = R_transposed
+    inverted[..., :3, 3] = -(R_transposed @ T[..., :3, 3:])[..., 0]
+    inverted[..., 3, 3] = 1.0
+    return inverted
 
 
 def between(start: FloatArray, end: FloatArray) -> FloatArray:

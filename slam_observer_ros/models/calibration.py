@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import to_ns
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.lie.axes import EstimatedAxes
@@ -155,7 +155,7 @@ class Calibration:
     @property
     def delay_ns(self) -> int:
         """The delay τ; where it is negative the latest velocity is held for longer."""
-        return to_ns(float(self._owner.calibration[DELAY]))
+        return round(float(self._owner.calibration[DELAY]) * NANOSECONDS_PER_SECOND)
 
     @property
     def calibrates_sensors(self) -> bool:

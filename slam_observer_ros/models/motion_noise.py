@@ -236,7 +236,7 @@ class MotionFactors:
 
     def take(self, factors: Factors | None) -> None:
         """Take over factors of :meth:`flat` that have learnt."""
-        self.forget_motion()
+        self._shares = np.zeros(())
         if factors is not None:
             self._logs, self._information = factors.logs, factors.information
             self.applied = factors.applied

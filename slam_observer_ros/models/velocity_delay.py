@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.models.calibration import Calibration
@@ -57,22 +57,26 @@ class DelayEvidence:
         if self._seen % SAMPLED:
             return
         delay_ns, reach_ns = calibration.delay_ns, calibration.delay_error_ns
-        duration_s = to_s(end_ns - start_ns)
+        duration_s = (end_ns - start_ns) / NANOSECONDS_PER_SECOND
         centres_ns = start_ns - delay_ns, end_ns - delay_ns
         stamps, V = velocities.between(centres_ns[0] - reach_ns, end_ns)
         if len(stamps) < 2 or stamps[0] == stamps[-1] or duration_s <= 0.0:
             return
         axes = calibration.axes.pose
         V = V[:, axes]
-        W = _weights(stamps, centres_ns[1], reach_ns, end_ns)
-        W -= _weights(stamps, centres_ns[0], reach_ns, start_ns)
+        # For how long each was in force: in the means around end and start, by the velocities that
+        # were known then, and in the motion.
+        around = np.array([[-reach_ns, reach_ns]])
+        spans_ns = np.concatenate([np.array(centres_ns)[::-1, None] + around, [centres_ns]])
+        after, before, in_force_ns = _overlaps(stamps, spans_ns, [end_ns, start_ns, stamps[-1]])
+        W = after / max(after.sum(), 1) - before / max(before.sum(), 1)
         stated = variances[axes] / duration_s
         is_noisy = stated > 0.0
         stated = stated[is_noisy]
         self._information += float((W.dot(V)[is_noisy] ** 2 / stated).sum()) / duration_s
         if len(stamps) < 3:  # a single step may be a change, as of commands by key press
             return
-        in_force_s = _overlaps(stamps, *centres_ns) / NANOSECONDS_PER_SECOND
+        in_force_s = in_force_ns / NANOSECONDS_PER_SECOND
         period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) / NANOSECONDS_PER_SECOND
         # How much noise there is: as stated, or less where velocities differ less.
         steps = np.sort(np.abs(V[1:] - V[:-1]), axis=0)[(len(V) - 1) // 2]
@@ -98,20 +102,15 @@ class DelayEvidence:
         return replace(delay, value=delay.value - pull, deviation=deviation)
 
 
-def _weights(stamps: IntArray, centre_ns: int, reach_ns: int, known_ns: int) -> FloatArray:
-    """Return the weights (m,) of velocities in :meth:`.VelocityHistory.mean`, asked at a stamp."""
-    known = int(stamps.searchsorted(known_ns, 'right'))
-    weights = np.zeros(len(stamps))
-    weights[:known] = _overlaps(stamps[:known], centre_ns - reach_ns, centre_ns + reach_ns)
-    total = weights.sum()
-    return weights / total if total else weights
+def _overlaps(stamps: IntArray, spans_ns: IntArray, known_ns: list[int]) -> IntArray:
+    """Return for how long (k, m) each velocity was in force in spans (k, 2), nanoseconds.
 
-
-def _overlaps(stamps: IntArray, start_ns: int, end_ns: int) -> IntArray:
-    """Return for how long (m,) each velocity was in force between two stamps, nanoseconds."""
-    # A fifth of what np.append, np.clip and np.diff cost, of so few.
-    bounds = np.empty(len(stamps) + 1, dtype=np.int64)
-    bounds[:-1], bounds[-1] = stamps, end_ns
-    bounds = np.minimum(np.maximum(bounds, start_ns), end_ns)
-    overlaps: IntArray = bounds[1:] - bounds[:-1]
+    Of each span by the velocities that were known at a stamp.
+    """
+    start, end = spans_ns[:, :1], spans_ns[:, 1:]
+    bounds = np.empty((len(spans_ns), len(stamps) + 1), dtype=np.int64)
+    bounds[:, :-1] = np.where(stamps > np.array(known_ns)[:, None], end, stamps)
+    bounds[:, -1:] = end
+    bounds = np.minimum(np.maximum(bounds, start), end)
+    overlaps: IntArray = bounds[:, 1:] - bounds[:, :-1]
     return overlaps

@@ -73,7 +73,7 @@ class VelocityHistory:
         self._stands = False
         # About which axes turns count.
         self._counts = np.array([0.0, 0.0, 1.0]) if is_planar else np.ones(3)
-        self._at_rest = _AtRest(self._counts * (np.zeros(3) if bias is None else -bias))
+        self.at_rest = _AtRest(self._counts * (np.zeros(3) if bias is None else -bias))
 
     def append(self, measured: MeasuredVelocity) -> bool:
         """Add velocities that are not earlier than any other; return whether they are in force.
@@ -86,7 +86,7 @@ class VelocityHistory:
             self._angular = measured
             if self._zero_since_ns is not None:
                 stood_ns = measured.stamp_ns - self._zero_since_ns
-                self._at_rest.add(stood_ns, self._counts * measured.angular_velocity)
+                self.at_rest.add(stood_ns, self._counts * measured.angular_velocity)
             if self._count == 1:
                 return False
             first = self._new_row(1)
@@ -121,7 +121,7 @@ class VelocityHistory:
         if stand:  # zero, and known to be, unless a gyroscope says otherwise
             joined, still = self._joined, np.array(stand)
             rates = self._counts * joined.body_velocities[still, :3]
-            turn = self._at_rest.turns(rates) & rates.any(axis=1)
+            turn = self.at_rest.turns(rates) & rates.any(axis=1)
             if np.count_nonzero(turn):
                 self.doubt_standing()
                 still = still[~turn]
@@ -149,11 +149,6 @@ class VelocityHistory:
     def doubt_standing(self) -> None:
         """Begin again to judge whether the robot stands: something else contradicts it."""
         self._zero_since_ns, self._stands = None, False
-
-    def taken_at_rest(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Return and forget means of a gyroscope at rest (3,), rad/s, with variances (3,)."""
-        taken, self._at_rest.means = self._at_rest.means, []
-        return taken
 
     def stood_s(self, stamp_ns: int) -> float:
         """Return for how long the robot has stood at a stamp, seconds; 0 while it moves."""
@@ -209,7 +204,7 @@ class VelocityHistory:
             dt_s=np.array([0.0 if timed_out else period_s]),
             gap_s=np.array([period_s if timed_out else 0.0]),
             before_s=np.zeros((1, 2)),
-            usual_s=np.array(self._usual_s()),
+            usual_s=np.array(self.flat()[5:7]),
         )
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
@@ -219,12 +214,16 @@ class VelocityHistory:
 
     def between(self, start_ns: int, end_ns: int) -> tuple[IntArray, FloatArray]:
         """Return stamps and measured velocities (m, 6) of those in force between two stamps."""
-        rows = slice(max(self._row(start_ns) - 1, 1), self._row(end_ns))
+        stamps_ns = self._joined.stamps_ns[: self._count]
+        first, end = stamps_ns.searchsorted((start_ns, end_ns), 'right').tolist()
+        rows = slice(max(first - 1, 1), end)
         return self._joined.stamps_ns[rows], self._joined.body_velocities[rows]
 
     def flat(self) -> Velocities:
         """Return all that are known as plain arrays."""
-        return self._flat(self._count, *self._usual_s())
+        linear_s = self._periods.usual_s
+        angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
+        return self._flat(self._count, angular_s, linear_s)
 
     def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
         """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
@@ -255,16 +254,12 @@ class VelocityHistory:
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
-        first, count = self._row(stamp_ns) - 1, self._count
+        count = self._count
+        first = int(self._joined.stamps_ns[:count].searchsorted(stamp_ns, 'right')) - 1
         if first > count // 2:
             kept = np.append(0, np.arange(first, count))
             self._joined = self._joined.copied(kept, len(self._joined.stamps_ns))
             self._count = len(kept)
-
-    def _usual_s(self) -> tuple[float, float]:
-        linear_s = self._periods.usual_s
-        angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
-        return angular_s, linear_s
 
     def _counting(self, body_velocities: FloatArray) -> FloatArray:
         """Return what counts of velocities (…, 6), as a copy: for all of a step at once."""

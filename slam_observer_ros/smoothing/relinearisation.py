@@ -28,8 +28,9 @@ import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError, SmoothingError
 from slam_observer_ros.common.findings import found
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.filter.flat_arrays import Advanced
+from slam_observer_ros.filter.flat_arrays import Advanced, Interval
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.observer import Observer
 from slam_observer_ros.lie import se3
@@ -114,7 +115,7 @@ class Past:
     def reset(self, since: str) -> None:
         """Begin a new history with the present estimate; ``since`` says why, in words."""
 
-    def move(self, start: FloatArray, motion: Advanced, duration_s: float) -> None:
+    def move(self, start: FloatArray, motion: Advanced, interval: Interval) -> None:
         """Note a motion of the robot from a pose (4, 4)."""
 
     def slip(self, start: FloatArray, motion: Advanced) -> None:
@@ -202,10 +203,10 @@ class Relinearisation(Past):
 
     def reset(self, since: str) -> None:
         """Begin a new history with the present estimate; ``since`` says why, in words."""
-        self._is_given_up = not self._is_dense
+        self._is_given_up = not self._errors.joint.is_dense
         self._start(self._known(), since)
 
-    def move(self, start: FloatArray, motion: Advanced, duration_s: float) -> None:
+    def move(self, start: FloatArray, motion: Advanced, interval: Interval) -> None:
         """Note a motion of the robot from a pose (4, 4)."""
         if not self.is_active:
             return
@@ -213,6 +214,7 @@ class Relinearisation(Past):
             # Their ways depend on how the robot was turned, which the smoother does not consider.
             self.reset('a landmark came with a velocity')
             return
+        duration_s = (interval.end_ns - interval.start_ns) / NANOSECONDS_PER_SECOND
         drift = self._calibration.drift_covariance * duration_s
         self.history.move(start, motion, drift, self._calibration)
 
@@ -252,7 +254,7 @@ class Relinearisation(Past):
         self.history.add(keyframe, self._observer.A.copy(), self._calibration.values)
         self._seen += 1
         self._observations += 1
-        if not self._is_dense:
+        if not self._errors.joint.is_dense:
             if self._window_is_full:
                 self.reset(CUT)
         elif in_doubt:
@@ -281,7 +283,7 @@ class Relinearisation(Past):
         """
         history, first = self.history, self.history.summarised
         marked = [np.array(history.marked(each.marks)) for each in seen]
-        if not (self.is_active and self._is_dense) or marked[0].min() < first:
+        if not (self.is_active and self._errors.joint.is_dense) or marked[0].min() < first:
             return None
         solution = self._solution_from(first)
         row, keyframes = len(solution.points), history.latest_keyframes()
@@ -331,7 +333,7 @@ class Relinearisation(Past):
         if not self.is_active or numbers.min() < 0:
             return
         self.history.attach(row, numbers, seen._replace(rows=np.full(len(numbers), row)))
-        if not self._is_dense:
+        if not self._errors.joint.is_dense:
             return
         are_latest = numbers.min() >= self.history.summarised
         if not (are_latest and self._relinearise(ENTRY_ITERATIONS)):
@@ -407,15 +409,6 @@ class Relinearisation(Past):
         start = self._without_outliers_of_then(smoother, start)
         return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE), slips
 
-    @property
-    def _joint(self) -> JointCovariance:
-        return self._errors.joint  # which may become one for large maps
-
-    @property
-    def _is_dense(self) -> bool:
-        """Whether P has all landmarks, so that it can take over a relinearised map."""
-        return self._joint.is_dense
-
     def _start(self, prior: Prior, since: str) -> None:
         self.history = History(self._axes, self._observation_noise, prior, since)
         self._clear_counts()
@@ -464,7 +457,7 @@ class Relinearisation(Past):
 
         Return whether it was: if they don't determine everything, more may do so later.
         """
-        if len(self._joint.P) - self._joint.first > MAX_UNKNOWNS:
+        if len(self._errors.joint.P) - self._errors.joint.first > MAX_UNKNOWNS:
             return False
         # Smooth them, after the summary of those before, …
         history, first = self.history, self.history.summarised
@@ -495,7 +488,7 @@ class Relinearisation(Past):
         observer.set_pose(start.poses[-1])
         observer.set_reference(start.points)
         P = _with_pose_error_by(observer.A, covariance, self._axes)
-        self._joint.set_of_positions(P, start.points)
+        self._errors.joint.set_of_positions(P, start.points)
         # The step, as any correction.
         self._calibration.shift(end.calibrations[-1] - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
@@ -528,7 +521,7 @@ class Relinearisation(Past):
 
     def _known(self) -> Prior:
         """Return the present estimate as a prior."""
-        observer, joint = self._observer, self._joint
+        observer, joint = self._observer, self._errors.joint
         points = observer.points[:0] if self._is_given_up else observer.points
         P = joint.of_robot if self._is_given_up else joint.of_positions(points)
         P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)

@@ -104,7 +104,7 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._new_landmarks = NewLandmarks()
-        self._standing = Standing()
+        self.standing = Standing()  # whether wheels spin, and what the robot carries along
         self._views: MapViews | None = None  # where the robot is in a map
         self._velocities: VelocityHistory | None = None  # along which they were moved
         self._delay_evidence = DelayEvidence()
@@ -267,7 +267,7 @@ class Hypotheses:
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all hypotheses on from ``start_ns``, where they are, to ``end_ns`` (27)."""
         stood_s, flat = velocities.stood_s(end_ns), velocities.flat()
-        at_rest = velocities.taken_at_rest()
+        at_rest, velocities.at_rest.means = velocities.at_rest.means, []
         for hypothesis in self._all:
             state = hypothesis.state
             state.observation_noise.stood_s = stood_s
@@ -277,7 +277,7 @@ class Hypotheses:
             variances = state.advance(flat, start_ns, end_ns)
             if state is not self.best:
                 continue
-            standing = self._standing
+            standing = self.standing
             standing.before, standing.pose = (
                 standing.pose,
                 standing.pose.dot(se3.between(before, state.observer.A)),
@@ -301,7 +301,7 @@ class Hypotheses:
         self._present = None
         for hypothesis in self._all:
             hypothesis.state.clear_time()
-        self._standing.clear_time()
+        self.standing.clear_time()
         self._views = None
 
     def forget(self, landmark_id: int) -> bool:
@@ -314,20 +314,24 @@ class Hypotheses:
         return bool(rows[0][0] >= 0)
 
     @property
-    def carried_ids(self) -> set[int]:
-        """Landmarks that move with the robot, and are not used."""
-        return self._standing.carried
-
-    @property
     def slips(self) -> bool:
         """Whether the wheels slip now."""
-        return self._standing.slip is not None
+        return self.standing.slip is not None
 
     def judge_slip(self, event: ObservationEvent) -> ObservationEvent:
         """Stop where the wheels spin; return an observation without landmarks that are carried."""
-        standing = self._standing
-        if event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame:
-            self._judge_standing(event)
+        standing, best = self.standing, self.best
+        is_due = event.stamp_ns >= standing.due_ns or event.sensor_frame != standing.sensor_frame
+        if is_due and self._can_weigh and self._velocities is not None:
+            were_carried = standing.carried
+            if (slip := standing.note(best, event, self._velocities)) is not None:
+                self._take(slip)
+            if newly := standing.carried - were_carried:
+                for state in self.states:
+                    state.counts.note(Change.CARRIED, np.array(sorted(newly)), event.stamp_ns)
+            if best.is_mapping:
+                for landmark_id in newly:
+                    self.forget(landmark_id)
         if standing.excluded:
             is_carried = np.isin(event.ids, list(standing.excluded))
             for hypothesis in self._all:
@@ -343,7 +347,10 @@ class Hypotheses:
         """
         if self._views is None and self._can_weigh:
             self._views = MapViews(self.best.axes, ids, covariances)
-        return self._views is not None and self._take(self._views.contradiction(self.best))
+        if self._views is None or (slip := self._views.contradiction(self.best)) is None:
+            return False
+        self._take(slip)
+        return True
 
     def _note_ambiguity(self, event: ObservationEvent) -> None:
         """Note whether points without ids fit several maps, after an observation."""
@@ -398,27 +405,11 @@ class Hypotheses:
         spread = L @ (np.tensordot(self.weights, moments, 1) + least) @ L.T
         return float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
 
-    def _judge_standing(self, event: ObservationEvent) -> None:
-        """Look whether wheels spin, and give up landmarks that the robot carries."""
-        standing, best = self._standing, self.best
-        if not self._can_weigh or self._velocities is None:
-            return
-        were_carried = standing.carried
-        self._take(standing.note(best, event, self._velocities))
-        if newly := standing.carried - were_carried:
-            for state in self.states:
-                state.counts.note(Change.CARRIED, np.array(sorted(newly)), event.stamp_ns)
-        if best.is_mapping:
-            for landmark_id in newly:
-                self.forget(landmark_id)
-
-    def _take(self, slip: Slip | None) -> bool:
-        """Let all hypotheses slip, if that is so; return whether it is."""
-        if slip is not None:
-            for state in self.states:
-                state.slip(state.observer.A @ slip.motion, slip.covariance)
-                state.counts['slip'] += slip.is_new
-        return slip is not None
+    def _take(self, slip: Slip) -> None:
+        """Let all hypotheses slip."""
+        for state in self.states:
+            state.slip(state.observer.A @ slip.motion, slip.covariance)
+            state.counts['slip'] += slip.is_new
 
     def associate(self, event: ObservationEvent) -> Iterator[Association]:
         """Yield states with the landmarks that points are of; those that are updated remain.
@@ -429,7 +420,8 @@ class Hypotheses:
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         best = self.best
-        is_clear = len(self._all) == 1 and not unknown and not may_name(best, event.ids)
+        some_may_be_named = best.landmarks.some_without_ids and may_name(best, event.ids)
+        is_clear = len(self._all) == 1 and not unknown and not some_may_be_named
         if is_clear or not self._can_weigh:
             if self._views is not None:
                 self._views.add(best, event)

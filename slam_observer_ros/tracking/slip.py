@@ -408,8 +408,11 @@ class Standing:
             slip = self._go_on(state, look)
         elif not self._starts:
             self._begin(look)
-        elif self._belongs_to_start(event):
-            self._starts.append(look)
+        elif (
+            event.stamp_ns - self._starts[0].event.stamp_ns < TOGETHER_NS // 2
+            and len(self._starts[0].event.ids) < LEAST
+        ) or all(event.sensor_frame != one.event.sensor_frame for one in self._starts):
+            self._starts.append(look)  # later observations are compared with this one, too
         else:
             since_ns = event.stamp_ns - TOGETHER_NS
             self._latest = [one for one in self._latest if one.event.stamp_ns > since_ns]
@@ -420,13 +423,6 @@ class Standing:
         is_whole = len(self._starts) == 1 and len(self._starts[0].event.ids) >= LEAST
         self.due_ns = self._test_ns if is_whole and self.slip is None else 0
         return slip
-
-    def _belongs_to_start(self, event: ObservationEvent) -> bool:
-        """Return whether later observations are compared with this one."""
-        start = self._starts[0].event
-        if event.stamp_ns - start.stamp_ns < TOGETHER_NS // 2 and len(start.ids) < LEAST:
-            return True
-        return all(event.sensor_frame != one.event.sensor_frame for one in self._starts)
 
     def _begin(self, look: Look) -> None:
         """Compare with this observation from now on."""

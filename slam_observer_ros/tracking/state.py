@@ -8,7 +8,6 @@ from copy import copy
 import numpy as np
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import Change, Outcomes, Smoothed, Update
 from slam_observer_ros.events import ObservationEvent
@@ -20,7 +19,6 @@ from slam_observer_ros.lie.matrices import correlations_of
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
 from slam_observer_ros.tracking import covariances
 
@@ -125,10 +123,12 @@ class State:
 
     def advance(self, velocities: Velocities, start_ns: int, end_ns: int) -> FloatArray:
         """Move on between two stamps (27); return the variances (6,) of the motion by axis."""
-        before = self.observer.A.copy()
-        motion = self.gains.advance(velocities, self._interval(start_ns, end_ns))
-        self.relinearisation.move(before, motion, to_s(end_ns - start_ns))
-        if self.calibration.delay_error_ns:
+        before, calibration = self.observer.A.copy(), self.calibration
+        delays_ns = calibration.delay_ns, calibration.delay_error_ns
+        interval = Interval(start_ns, end_ns, *delays_ns, self.end_velocity)
+        motion = self.gains.advance(velocities, interval)
+        self.relinearisation.move(before, motion, interval)
+        if calibration.delay_error_ns:
             self.end_velocity = motion.at_end
         return motion.variances
 
@@ -214,17 +214,6 @@ class State:
         self.gains.fix_landmarks(known)
         self.landmark_velocity_stddev = 0.0
         self.relinearisation = Past()  # there is no drift to undo
-
-    def keep(self, keyframe: Keyframe, in_doubt: bool = False) -> None:
-        """Keep an observation to be linearised again, but none more of a robot that is parked.
-
-        They would say nothing more, and take the place of the drive's observations.
-        """
-        stands = self.observation_noise.stood_s > 0.0
-        if stands and not in_doubt and keyframe.repeated.min(initial=np.inf) > OLD_NEWS:
-            self.counts['parked_observation'] += 1
-        else:
-            self.relinearisation.add(keyframe, in_doubt)
 
     def smooth(self) -> Smoothed:
         """Return the smoothed trajectory and map; see :meth:`.Relinearisation.smooth`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.flat_arrays import Limits, Seen
 from slam_observer_ros.filter.observer import lyapunov
 from slam_observer_ros.filter.robust import accepted
-from slam_observer_ros.lie import se3, so3
+from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.sensor_mounting import Sensed, unmeasured_covariances
 from slam_observer_ros.models import sensing
 from slam_observer_ros.models.motion_noise import beyond_driving
@@ -28,7 +29,7 @@ from slam_observer_ros.tracking.matching import (
     residuals_of,
     sensitivity,
 )
-from slam_observer_ros.tracking.state import Association, State
+from slam_observer_ros.tracking.state import Association, OLD_NEWS, State
 from slam_observer_ros.tracking.tags import (
     correct_by_orientations,
     seen_orientations,
@@ -36,6 +37,8 @@ from slam_observer_ros.tracking.tags import (
 )
 
 NO_IDS = np.empty(0, dtype=np.int64)
+
+_PLAIN = partial(np.ascontiguousarray, dtype=np.float64)
 
 
 def step(
@@ -127,12 +130,20 @@ def append(one: Association) -> None:
     """Keep what was seen of the map's landmarks, to be linearised again."""
     state, settings = one.state, one.state.settings
     # After the correction it is known better where doubtful landmarks were seen.
-    in_doubt = state.landmarks.in_doubt(one.at, settings.max_rejections) & state.is_mapping
-    one.in_doubt = in_doubt
+    table, some_in_doubt = state.landmarks, False
+    one.in_doubt = np.zeros(len(one.at), dtype=np.bool_)
+    if state.is_mapping and np.count_nonzero(table.rejections[one.at]):
+        one.in_doubt = table.in_doubt(one.at, settings.max_rejections)
+        some_in_doubt = bool(np.count_nonzero(one.in_doubt))
     if state.relinearisation.is_active and len(one.at):
         has_turns = one.event.orientations is not None
         turns = seen_orientations(state, one.in_map, one.at) if has_turns else None
-        state.keep(keyframe(one, turns), bool(np.count_nonzero(in_doubt)))
+        kept, stands = keyframe(one, turns), state.observation_noise.stood_s > 0.0
+        # A robot that is parked says nothing more, in place of the drive's observations.
+        if stands and not some_in_doubt and kept.repeated.min(initial=np.inf) > OLD_NEWS:
+            state.counts['parked_observation'] += 1
+        else:
+            state.relinearisation.add(kept, some_in_doubt)
 
 
 def follow_moved(one: Association) -> Update:
@@ -149,7 +160,7 @@ def follow_moved(one: Association) -> Update:
         event.stamp_ns,
         observer.pose,
         one.event.ids[known],
-        se3.rotate(observer.reference_pose, r[known]),
+        r[known].dot(observer.reference_pose[:3, :3].T),
         one.rejected[known],
         lyapunov(state.settings.gain_k, r[known]),
         moved_ids,
@@ -235,9 +246,9 @@ def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
 
     Of points that were carried forward, the calibration's effect is given.
     """
-    arms, covariances = _plain(event.lines_of_sight), event.covariances
-    origins = event.sensor
-    calibration = state.calibration
+    origins, covariances, calibration = event.sensor, event.covariances, state.calibration
+    # Arrays may be of another precision or order than C has them.
+    arms = _PLAIN(event.points if origins is None else event.points - origins)
     values, estimated, column, D = None, NO_IDS, 0, None
     directions = event.directions
     if event.sensed is not None:
@@ -259,19 +270,14 @@ def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
         event.stamp_ns,
         rows,
         arms,
-        None if origins is None else _plain(origins),
-        None if covariances is None else _plain(covariances),
-        None if directions is None else _plain(directions),
+        None if origins is None else _PLAIN(origins),
+        None if covariances is None else _PLAIN(covariances),
+        None if directions is None else _PLAIN(directions),
         values,
         estimated,
         column,
-        None if D is None else _plain(D),
+        None if D is None else _PLAIN(D),
     )
-
-
-def _plain(array: FloatArray) -> FloatArray:
-    """Return an array that may be of another precision or order as C has it."""
-    return np.ascontiguousarray(array, np.float64)
 
 
 def keyframe(one: Association, turns: SeenOrientations | None) -> Keyframe:

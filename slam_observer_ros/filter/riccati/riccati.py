@@ -86,16 +86,20 @@ class RiccatiGains(OrientationGains):
     ) -> Observed | None:
         """Move the state, and P with it, by the innovation (28)–(31): :func:`.step.observe`."""
         observer, joint, factors = self.observer, self.joint, self.motion_noise.factors
-        known = seen.rows >= 0
-        rows, places = seen.rows[known], np.full(len(known), -1)
-        joint.activate(rows)
-        places[known] = joint.places(rows)
+        known, table = seen.rows >= 0, observer.landmarks
+        rows = seen.rows[known]
+        if not joint.is_dense:
+            joint.activate(rows)
+            places = np.full(len(known), -1)
+            places[known] = joint.places(rows)
+            seen = seen._replace(rows=places)
         x, learnt = self.flat(), factors.flat() if len(rows) else None
-        columns, in_arrays = observer.landmarks.columns, joint.active
+        columns = table.counts, table.rejections, table.last_seen_ns, table.seen_before_ns
+        in_arrays = joint.active
         if observer.is_exact:
             in_arrays = slice(None)
         landmarks = Landmarks(*[column[in_arrays] for column in columns])
-        out, seen = room_for(seen, x.size, is_judged), seen._replace(rows=places)
+        out = room_for(seen, x.size, is_judged)
         if core.observe(x, landmarks, seen, figures, limits, learnt, out) == step.REJECTS:
             return None
         if len(rows):
@@ -106,7 +110,8 @@ class RiccatiGains(OrientationGains):
                 column[in_arrays] = changed
         before = x.A.copy()
         x.A[...] = out.A
-        joint.follow(out.moved)
+        if not joint.is_dense:
+            joint.follow(out.moved)
         self._move_others(out.moved, before)
         return out
 
