@@ -13,10 +13,14 @@ from slam_observer_ros.estimates import Outcomes, Update
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.constant import ConstantGains
 from slam_observer_ros.filter.gains import Gains
+from slam_observer_ros.filter.observer import Observer
 from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3
+from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.localiser import is_rough, Localiser
+from slam_observer_ros.models.calibration import Calibration, without_calibration
+from slam_observer_ros.models.motion_noise import MotionNoise
 from slam_observer_ros.settings.estimator_settings import LiveSettings, Settings
 from slam_observer_ros.tracking.half_points import take_scales
 from slam_observer_ros.tracking.hypotheses import Hypotheses
@@ -35,9 +39,14 @@ GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 """Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
 
 
-def make_gains(settings: Settings, reference_pose: FloatArray) -> Gains:
-    """Return what the setting ``gains`` names, at P° = ``reference_pose`` (4, 4)."""
-    return DESIGNS[settings.gains](settings, reference_pose)
+def make_gains(
+    settings: Settings, reference_pose: FloatArray, design: type[Gains] | None = None
+) -> Gains:
+    """Return a design, by default what ``gains`` names, at P° = ``reference_pose`` (4, 4)."""
+    design, observer = design or DESIGNS[settings.gains], Observer(reference_pose)
+    estimated = settings if design.estimates_calibration else without_calibration(settings)
+    calibration = Calibration(observer, estimated, axes_of(settings.two_d_mode))
+    return design(settings, observer, calibration, MotionNoise(settings))
 
 
 class Placement:

@@ -56,7 +56,7 @@ class ConstantGains(Gains):
     ) -> Observed:
         """Move the state by the innovation (28)–(31) of all that is seen: nothing is rejected."""
         known, out = seen.rows >= 0, room_for(seen, 0, is_judged)
-        out.points[:], out.origins[:], _ = located(seen, self._settings.two_d_mode)
+        out.points[:], out.origins[:], _ = located(seen, self.axes.point == 2)
         rows, landmarks = seen.rows[known], self.observer.landmarks
         out.r[:], out.weights[:] = 0.0, known
         if len(rows):
@@ -72,16 +72,16 @@ class ConstantGains(Gains):
         Return their residuals (m, 3) until then.
         """
         # The gains, and how long they act.
-        settings, (e, r) = self._settings, self.observer.errors(rows, points)
-        gain_l = 0.0 if self.observer.is_exact else settings.gain_l
-        k = np.full(len(r), settings.gain_k)
-        step = paper_step if settings.step_mode == 'paper' else centroid_step
-        dt_s = np.minimum(dt_s, settings.max_innovation_time)
+        tuning, (e, r) = self._tuning, self.observer.errors(rows, points)
+        gain_l = 0.0 if self.observer.is_exact else tuning.gain_l
+        k = np.full(len(r), tuning.gain_k)
+        step = paper_step if tuning.step_mode == 'paper' else centroid_step
+        dt_s = np.minimum(dt_s, tuning.max_innovation_time)
         # One time for the pose: were the r_i to act for different ones, L (34) might grow.
         D = safe_step(partial(step, axes=self.axes), k, e, r, float(np.mean(dt_s)))  # (30)
         # What the pose's step leaves of each residual is closed in part by its landmark.
         remaining = se3.transform(D, e) - e + r
-        shares = -np.expm1(-gain_l / settings.gain_k * dt_s)
+        shares = -np.expm1(-gain_l / tuning.gain_k * dt_s)
         d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
         self.observer.correct(D, rows, d)
         return r

@@ -5,7 +5,7 @@ Arrays are contiguous, of float64 or int64. Frames and units are as in :mod:`.ob
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 
@@ -96,3 +96,43 @@ class Observed(NamedTuple):
     # (3 m + 1,) distances, logarithms of the densities and shares of m residuals, and the
     # normalised innovation squared of those used, zero at first; empty where nobody asks
     judged: FloatArray
+
+
+class Tuning(Protocol):
+    """What the filter is tuned by, as it is in force now: parameters of these names."""
+
+    @property
+    def rejection_threshold(self) -> float:
+        """Gate, standard deviations."""
+
+    @property
+    def huber_threshold(self) -> float:
+        """The same from which on weights fall, 0 for none."""
+
+    @property
+    def max_rejections(self) -> int:
+        """Rejections in a row, which make a landmark doubtful."""
+
+    @property
+    def use_tag_orientation(self) -> bool:
+        """Whether tags correct by how they are turned."""
+
+    @property
+    def landmark_velocity_stddev(self) -> float:
+        """Of velocities that are estimated, m/s; 0 for none."""
+
+    @property
+    def gain_k(self) -> float:
+        """Of constant gains: k (30), and so on."""
+
+    @property
+    def gain_l(self) -> float:
+        """L (31)."""
+
+    @property
+    def step_mode(self) -> str:
+        """'paper' or 'exponential'."""
+
+    @property
+    def max_innovation_time(self) -> float:
+        """Time that an innovation acts at most, seconds."""

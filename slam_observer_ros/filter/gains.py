@@ -27,20 +27,17 @@ from slam_observer_ros.filter.flat_arrays import (
     Limits,
     Observed,
     Seen,
+    Tuning,
 )
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Observer, Residuals
-from slam_observer_ros.lie.axes import axes_of, EstimatedAxes
+from slam_observer_ros.lie.axes import EstimatedAxes
 from slam_observer_ros.lie.matrices import mahalanobis, with_blocks
-from slam_observer_ros.models.calibration import (
-    Calibration,
-    without_calibration,
-)
+from slam_observer_ros.models.calibration import Calibration
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.motion_noise import MotionNoise
 from slam_observer_ros.models.point_noise import PointFigures
-from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -118,22 +115,22 @@ class TagGains(Protocol):
 
 
 class Gains(ABC):
-    """What moves an ``observer``'s X̂, which starts at ``reference_pose`` P° (4, 4)."""
+    """What moves an ``observer``'s X̂, by a calibration and a noise of motions."""
 
     ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect
+    estimates_calibration: ClassVar[bool] = False
     joint: JointCovariance | None = None  # P, if it is known
 
-    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
-        self._settings = settings
-        self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
-        self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
-        self.calibration = Calibration(self.observer, self.estimated(settings), self.axes)
-        self.motion_noise = MotionNoise(settings)
-
-    @staticmethod
-    def estimated(settings: Settings) -> Settings:
-        """Return the settings without what these gains do not estimate of a calibration."""
-        return without_calibration(settings)
+    def __init__(
+        self,
+        tuning: Tuning,
+        observer: Observer,
+        calibration: Calibration,
+        motion_noise: MotionNoise,
+    ) -> None:
+        self._tuning, self.axes = tuning, calibration.axes  # what of pose and points is estimated
+        self.observer = observer  # X̂ and its reference ξ°
+        self.calibration, self.motion_noise = calibration, motion_noise
 
     def copy(self) -> Self:
         """Return an independent copy."""
@@ -175,7 +172,7 @@ class Gains(ABC):
             size,
             first,
             stride,
-            self._settings.two_d_mode,
+            self.axes.point == 2,
             calibration.rates,
             calibration.velocity_places,
             calibration.drift_covariance,
@@ -249,7 +246,7 @@ class Gains(ABC):
             size=size,
             first=size,
             stride=0,
-            is_planar=self._settings.two_d_mode,
+            is_planar=self.axes.point == 2,
             rates=calibration.rates,
             estimated=calibration.velocity_places,
             drift=calibration.drift_covariance,

@@ -15,13 +15,13 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.filter.flat_arrays import Tuning
 from slam_observer_ros.lie.matrices import (
     diagonal_blocks,
     mahalanobis,
     solve_definite,
     with_blocks,
 )
-from slam_observer_ros.settings.estimator_settings import Settings
 
 AT_ONCE = 32
 """Points that are used at once. Of more, each block of so many is judged after the one before."""
@@ -70,7 +70,7 @@ def reweighted(
 
 
 def gated_weights(
-    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, tuning: Tuning
 ) -> FloatArray:
     """Return the weight (m,) of each orientation of a tag, zero where the gate rejects it.
 
@@ -80,11 +80,11 @@ def gated_weights(
     noise R as in an M-estimator: where the state is uncertain a large residual r is no outlier.
     """
     k = r.shape[1]
-    passed = accepted_points(r, with_blocks(predicted, noise), settings.rejection_threshold)
+    passed = accepted_points(r, with_blocks(predicted, noise), tuning.rejection_threshold)
     used = np.flatnonzero(np.repeat(passed, k))
     weights = np.zeros(len(r))
     weights[passed] = reweighted(
-        r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
+        r[passed], predicted[np.ix_(used, used)], noise[passed], tuning.huber_threshold
     )
     return weights
 

@@ -19,6 +19,7 @@ from random_runs import (
 )
 from strategies import generators
 
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.riccati import outside_landmarks, postponed
@@ -56,10 +57,6 @@ class SameReferences(RiccatiGains):
 
     block = BlockSize(dense=10**9)
 
-    def __init__(self, settings, compressed):
-        super().__init__(settings, np.eye(4))
-        self.compressed = compressed
-
     def advance(self, velocities, interval):
         joint = self.compressed.joint
         points = self.compressed.observer.points if joint.is_dense else joint.references
@@ -71,8 +68,10 @@ class SameReferences(RiccatiGains):
 
 def pair(settings):
     """The compressed filter and the dense one."""
-    compressed = Compressed(settings, np.eye(4))
-    return compressed, SameReferences(settings, compressed)
+    compressed = make_gains(settings, np.eye(4), Compressed)
+    dense = make_gains(settings, np.eye(4), SameReferences)
+    dense.compressed = compressed
+    return compressed, dense
 
 
 class World:

@@ -11,9 +11,9 @@ import slam_group
 from slam_group import SlamElement, TotalState
 from strategies import generators, poses, rotations
 
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.filter.constant import (
     centroid_step,
-    ConstantGains,
     paper_step,
     safe_step,
 )
@@ -40,7 +40,9 @@ def paper_observation(time_s):
 
 def biased_filter(reference_pose=None, bias_m=0.5):
     """Constant gains whose reference landmarks carry a bias, as in section VI."""
-    biased = ConstantGains(Settings(), np.eye(4) if reference_pose is None else reference_pose)
+    biased = make_gains(
+        Settings(gains='constant'), np.eye(4) if reference_pose is None else reference_pose
+    )
     directions = np.random.default_rng(3).normal(size=(4, 3))
     biases = bias_m * directions / np.linalg.norm(directions, axis=1)[:, None]
     biased.add(paper_observation(0.0) + biases, NO_NOISE)
@@ -86,7 +88,7 @@ def test_errors_are_rho_of_the_inverse_state_29():
 
 @given(poses(), generators())
 def test_estimate_is_phi_of_state_and_reference_23(reference_pose, rng):
-    estimated = ConstantGains(Settings(), reference_pose)
+    estimated = make_gains(Settings(gains='constant'), reference_pose)
     observer = estimated.observer
     observer.add_reference_landmarks(rng.normal(size=(4, 3)))
     observer.A[...] = se3.exp(rng.normal(size=6))
@@ -101,7 +103,7 @@ def test_estimate_is_phi_of_state_and_reference_23(reference_pose, rng):
 def test_residual_vanishes_exactly_where_the_output_fits_for_any_reference_pose(
     reference_pose, rng
 ):
-    estimated = ConstantGains(Settings(), reference_pose)
+    estimated = make_gains(Settings(gains='constant'), reference_pose)
     observer = estimated.observer
     observer.A[...] = se3.exp(rng.normal(size=6))
     points = rng.normal(size=(3, 3))
@@ -114,7 +116,7 @@ def test_residual_vanishes_exactly_where_the_output_fits_for_any_reference_pose(
 
 
 def test_a_path_that_was_moved_along_stays_as_it_was():
-    gains = ConstantGains(Settings(), np.eye(4))
+    gains = make_gains(Settings(gains='constant'), np.eye(4))
     V = np.array([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]])
     path = propagate(gains, V, np.array([0.5]), np.zeros((1, 6, 6))).A
     before = path.copy()
@@ -188,8 +190,9 @@ def test_lyapunov_never_increases_at_any_step_gain_distance_and_rotation(
     dt_s = 10.0**log_dt * rng.uniform(0.0, 1.0, n) ** rng.integers(0, 2)
     y_ref = distance_m * rng.normal(size=(n, 3))
     points = y_ref @ turn.T + 0.3 * distance_m * rng.normal(size=(n, 3))
-    settings = Settings(gain_k=k, gain_l=k * rng.uniform(0.01, 10.0), step_mode=step_mode)
-    constant = ConstantGains(settings, np.eye(4))
+    gain_l = k * rng.uniform(0.01, 10.0)
+    settings = Settings(gains='constant', gain_k=k, gain_l=gain_l, step_mode=step_mode)
+    constant = make_gains(settings, np.eye(4))
     constant.add_known(KnownLandmarks(y_ref, np.zeros((n, 3, 3))))
     observe(constant, np.arange(n), points, dt_s)
     _, remaining = constant.observer.errors(slice(None), points)
@@ -212,8 +215,8 @@ def test_paper_step_converges_to_the_paper_ode_with_first_order():
 
 @given(generators(), st.integers(1, 6))
 def test_the_paper_step_mode_moves_the_state_by_the_innovation_30_31(rng, n):
-    settings = Settings(gain_k=2.0, gain_l=3.0, step_mode='paper')
-    constant, dt_s = ConstantGains(settings, np.eye(4)), 1e-7
+    settings = Settings(gains='constant', gain_k=2.0, gain_l=3.0, step_mode='paper')
+    constant, dt_s = make_gains(settings, np.eye(4)), 1e-7
     observer = constant.observer
     observer.add_reference_landmarks(rng.normal(size=(n, 3)))
     observer.A[...], observer.a[...] = se3.exp(rng.normal(size=6)), rng.normal(size=(n, 3))
@@ -239,7 +242,7 @@ def test_far_landmarks_that_overflow_the_explicit_step_converge():
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(100, 3))
     y_ref = 50.0 * directions / np.linalg.norm(directions, axis=1)[:, None]
-    constant, levels = ConstantGains(Settings(), np.eye(4)), []
+    constant, levels = make_gains(Settings(gains='constant'), np.eye(4)), []
     known = y_ref + 0.5 * rng.normal(size=y_ref.shape)
     constant.add_known(KnownLandmarks(known, np.zeros((100, 3, 3))))
     for _ in range(500):

@@ -22,12 +22,12 @@ from random_runs import (
 import slam_group
 from strategies import generators, poses
 
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.filter import core
 from slam_observer_ros.filter import step as filter_step
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Observer
-from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -40,7 +40,7 @@ CALIBRATED = replace(PLAIN, angular_bias_stddev=(0.02,) * 3, linear_scale_stddev
 
 def started(rng, settings=PLAIN, n=4):
     """A filter that has seen n landmarks, then moved and seen some of them again."""
-    riccati = RiccatiGains(settings, np.eye(4))
+    riccati = make_gains(settings, np.eye(4))
     riccati.add(rng.normal(scale=4.0, size=(n, 3)), 0.01 * random_covariances(rng, n, 3))
     for _ in range(5):
         random_step(riccati, rng, 1e-4, 1e-2)
@@ -118,7 +118,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     pieces, dt_s = 20, 0.01
     V = rng.normal(size=(pieces, 6))
     Q = 1e-2 * random_covariances(rng, pieces, 6)
-    riccati = RiccatiGains(PLAIN, np.eye(4))
+    riccati = make_gains(PLAIN, np.eye(4))
     riccati.observer.A[...] = start = se3.exp(rng.normal(size=6))
     propagate(riccati, V, np.full(pieces, dt_s), Q)
 
@@ -148,7 +148,7 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
     def predicted(point, velocity):
         """The covariances of the residual after two blind motions of a second each."""
         settings = replace(PLAIN, two_d_mode=two_d_mode, landmark_velocity_stddev=1e-9)
-        riccati = RiccatiGains(settings, np.eye(4))
+        riccati = make_gains(settings, np.eye(4))
         riccati.add(point, np.zeros((1, 3, 3)))
         riccati.observer.set_landmark_velocities(np.array([0]), velocity)
         propagate(riccati, V, dt_s, Q)
@@ -167,7 +167,7 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
 def test_an_observation_needs_no_more_memory_than_a_few_times_that_of_the_covariance(landmarks):
     """With the motion that leads to it: no other matrix is as large for more than a moment."""
     rng, rows = np.random.default_rng(0), np.arange(10)
-    riccati = RiccatiGains(PLAIN, np.eye(4))
+    riccati = make_gains(PLAIN, np.eye(4))
     points = rng.normal(size=(landmarks, 3))
     riccati.add(points, random_covariances(rng, landmarks, 3))
     V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
@@ -192,7 +192,7 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     Q[axes.pose, axes.pose] = 1e-4 * np.eye(axes.p)
     R = np.diag([1e-3, 2e-3, 3e-3])
     point = np.array([[2.0, -1.0, 0.0 if two_d_mode else 0.5]])
-    riccati = RiccatiGains(replace(PLAIN, two_d_mode=two_d_mode), np.eye(4))
+    riccati = make_gains(replace(PLAIN, two_d_mode=two_d_mode), np.eye(4))
     riccati.add(point, R[None])
     propagate(riccati, V, np.full(pieces, 0.1), np.tile(Q, (pieces, 1, 1)))
     seen = se3.transform(se3.inverse(riccati.observer.A), point)
@@ -220,7 +220,7 @@ def test_observations_never_determine_where_the_worlds_frame_is(rng):
 
     def run(frame_covariance):
         random = np.random.default_rng(seed)
-        riccati = RiccatiGains(PLAIN, np.eye(4))
+        riccati = make_gains(PLAIN, np.eye(4))
         riccati.set_pose(np.eye(4), frame_covariance)
         points = random.normal(scale=4.0, size=(4, 3))
         riccati.add(points, 0.01 * random_covariances(random, 4, 3))
@@ -241,7 +241,7 @@ def test_covariance_stays_symmetric_and_positive_over_many_steps_of_any_noise(
     point_variance_exponents,
 ):
     rng = np.random.default_rng(4)
-    riccati = RiccatiGains(PLAIN, np.eye(4))
+    riccati = make_gains(PLAIN, np.eye(4))
     riccati.add(rng.normal(scale=4.0, size=(3, 3)), np.tile(1e-2 * np.eye(3), (3, 1, 1)))
     steps, dt_s = 3_000, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
@@ -303,7 +303,7 @@ def test_a_landmark_that_is_relocated_is_as_new_and_the_others_stay(rng):
 
 
 def test_in_an_exact_map_nothing_is_known_of_pose_and_landmarks_together():
-    riccati = RiccatiGains(PLAIN, np.eye(4))
+    riccati = make_gains(PLAIN, np.eye(4))
     riccati.fix_landmarks(KnownLandmarks(np.eye(3), np.tile(0.01 * np.eye(3), (3, 1, 1))))
     assert riccati.joint_covariance(np.arange(3)) is None
 
@@ -393,7 +393,7 @@ def test_the_order_of_landmarks_in_a_message_does_not_matter():
 
 
 def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees():
-    riccati = RiccatiGains(PLAIN, np.eye(4))
+    riccati = make_gains(PLAIN, np.eye(4))
     riccati.add(np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1)))
     # It takes itself to be at rest, but may have turned by 0.3 rad; it has turned by 0.6.
     Q = np.diag([1e-8, 1e-8, 0.3**2, 1e-4, 1e-4, 1e-4])

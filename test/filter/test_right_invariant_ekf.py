@@ -8,7 +8,7 @@ from random_runs import as_stated, covariance_of_all, observe, PLAIN, propagate,
 from scipy.linalg import block_diag, expm
 from strategies import generators
 
-from slam_observer_ros.filter.riccati.riccati import RiccatiGains
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.lie.so3 import hat
 
 
@@ -85,7 +85,7 @@ def assert_same(riccati, ekf):
 @given(generators())
 def test_riccati_filter_is_the_right_invariant_ekf(rng):
     """Over random motions, observations, new landmarks and ones that are placed again."""
-    riccati, ekf = RiccatiGains(PLAIN, np.eye(4)), RightInvariantEkf()
+    riccati, ekf = make_gains(PLAIN, np.eye(4)), RightInvariantEkf()
     for number in range(30):
         V, dt_s = rng.normal(size=(2, 6)), rng.integers(50, 200, 2) / 1000.0
         Q = 1e-3 * random_covariances(rng, 2, 6)

@@ -10,8 +10,8 @@ import pytest
 from random_runs import as_stated, observe, PLAIN, propagate, random_covariances
 from strategies import generators
 
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.filter.arrays import SeenOrientations
-from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.tracking.matching import flipped
 
@@ -21,7 +21,7 @@ PLANAR_TAGS = replace(TAGS, two_d_mode=True)
 
 def tag_filter(rng, n=3, settings=TAGS):
     """A filter with n tags, which then has moved."""
-    tags = RiccatiGains(settings, np.eye(4))
+    tags = make_gains(settings, np.eye(4))
     points = rng.normal(scale=4.0, size=(n, 3)) * [1.0, 1.0, not settings.two_d_mode]
     tags.add(points, 0.01 * random_covariances(rng, n, 3))
     tags.add_orientations(seen(np.arange(n), so3.exp(rng.normal(size=(n, 3))), 0.05))
@@ -76,7 +76,7 @@ def test_orientations_that_are_never_seen_leave_the_filter_of_points(rng):
             observe(filter_, rows, points, random_covariances(random, 2, 3))
         return filter_
 
-    points, tags = run(RiccatiGains(PLAIN, np.eye(4))), run(RiccatiGains(TAGS, np.eye(4)))
+    points, tags = run(make_gains(PLAIN, np.eye(4))), run(make_gains(TAGS, np.eye(4)))
     rows = np.arange(4)
     np.testing.assert_allclose(tags.observer.A, points.observer.A, atol=1e-12)
     np.testing.assert_allclose(tags.observer.points, points.observer.points, atol=1e-11)
@@ -131,7 +131,7 @@ def test_no_orientation_tells_where_the_worlds_frame_is(rng):
 
 def test_one_tag_in_view_tells_the_heading_which_its_position_does_not():
     def heading_variance(with_orientation):
-        tags = RiccatiGains(TAGS, np.eye(4))
+        tags = make_gains(TAGS, np.eye(4))
         tags.add(np.array([[3.0, 0.0, 0.0]]), 1e-4 * np.eye(3)[None])
         tags.add_orientations(seen(np.array([0]), np.eye(3)[None], 0.02))
         Q = np.diag([0.1, 0.1, 0.1, 0.3, 0.3, 0.3])[None]
@@ -160,7 +160,7 @@ def one_drive(settings, n, seed):
     rng = np.random.default_rng(seed)
     is_flat = settings.two_d_mode
     only = np.array([0, 0, 1, 1, 1, 0]) if is_flat else np.ones(6)
-    tags, A = RiccatiGains(settings, np.eye(4)), np.eye(4)
+    tags, A = make_gains(settings, np.eye(4)), np.eye(4)
     points = np.array([[2.0 * i, 1.0, 0.0] for i in range(n)])
     turns = np.zeros((n, 3)) if is_flat else rng.normal(size=(n, 3))
     B, Q, sigma_m, sigma_rad = so3.exp(turns), 1e-4 * np.diag(only), 0.03, 0.03
@@ -206,7 +206,7 @@ def test_a_flipped_tag_looks_the_same_from_afar_and_flips_back(rng):
 @pytest.mark.parametrize('sigma_rad', [0.02, 0.3])
 def test_of_an_orientation_and_its_twin_the_likelier_one_is_used_and_none_if_both_are(sigma_rad):
     """With a heading known to 0.02 rad it is clear which of the two it is, to 0.3 rad it isn't."""
-    tags, rows = RiccatiGains(TAGS, np.eye(4)), np.array([0])
+    tags, rows = make_gains(TAGS, np.eye(4)), np.array([0])
     away, tilted = np.array([[4.0, 0.0, 0.0]]), so3.exp(np.array([[0.0, np.pi / 2 + 0.3, 0.0]]))
     tags.add(away, 1e-4 * np.eye(3)[None])
     tags.add_orientations(seen(rows, tilted, 0.02))

@@ -76,7 +76,7 @@ def observe(
 ) -> FloatArray:
     """Correct a filter by landmarks (m,) seen at ``points`` (m, 3); return their weights."""
     seen = ObservationEvent(0, rows, points, covariances)
-    one = Association(State(filter_, filter_._settings), seen, rows)
+    one = Association(State(filter_, filter_._tuning), seen, rows)
     assert observe_by_state(one)
     return one.out.weights
 

@@ -18,6 +18,7 @@ import yaml
 
 from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
@@ -222,7 +223,7 @@ class TestInAnotherFrame:
 def mapped(rng, settings, n=8, design=RiccatiGains):
     """A filter that has seen n landmarks, and moved."""
     flat = np.array([1.0, 1.0, not settings.two_d_mode])
-    filter_ = design(settings, np.eye(4))
+    filter_ = make_gains(settings, np.eye(4), design)
     filter_.add(rng.uniform(-5.0, 5.0, (n, 3)) * flat, 0.01 * random_covariances(rng, n, 3))
     for _ in range(4):
         random_step(filter_, rng, 1e-3, 1e-2)

@@ -16,10 +16,10 @@ from strategies import generators
 
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.filter.arrays import FilterArrays
 from slam_observer_ros.filter.flat_arrays import Interval
-from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.models import calibration as calibrations
@@ -400,7 +400,7 @@ def test_only_axes_of_the_motion_are_calibrated(axes, count):
 
 @given(generators(), st.booleans())
 def test_sensitivity_is_the_derivative_of_the_motion(rng, two_d_mode):
-    gains = RiccatiGains(replace(EVERYTHING, two_d_mode=two_d_mode), np.eye(4))
+    gains = make_gains(replace(EVERYTHING, two_d_mode=two_d_mode), np.eye(4))
     pieces, dt_s = 5, 0.01
     calibration, axes = gains.calibration, gains.axes
     V = np.zeros((pieces, 6))
@@ -447,7 +447,7 @@ def test_drift_lets_the_uncertainty_grow_with_time():
         velocity_delay_stddev=0.0,
         calibration_drift=0.5,
     )
-    gains = RiccatiGains(settings, np.eye(4))
+    gains = make_gains(settings, np.eye(4))
     still = held(np.zeros((4, 6)), np.ones(4))
     still = still._replace(timeout_ns=10**9 // 2)  # half of the time none is known
     gains.advance(still, Interval(0, 4 * 10**9, 0, 0, None))
@@ -479,7 +479,7 @@ def test_relinearising_does_not_undo_that_a_scale_has_changed():
 
 def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
     """As a robot that is carried; though its velocity has a bias, which is no motion either."""
-    gains = RiccatiGains(EVERYTHING, np.eye(4))
+    gains = make_gains(EVERYTHING, np.eye(4))
     gains.calibration.shift(np.full(gains.calibration.count, 0.1))
     there = se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))
     assert not gains.slip(there, np.zeros((6, 6))).sensitivity.any()

@@ -11,8 +11,8 @@ from random_runs import held, propagate
 
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.filter.flat_arrays import Interval
-from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.models.held_velocities import HeldVelocities
 from slam_observer_ros.models.motion_noise import gated_score, MotionFactors, MotionNoise
 from slam_observer_ros.runs.health import of_noise
@@ -127,7 +127,7 @@ def test_gaps_and_a_robot_that_stands_say_nothing():
 
 @pytest.mark.parametrize('what', ['it stands', 'a gap', 'a slip'])
 def test_of_what_motion_nothing_can_be_learnt(what):
-    gains, noise = RiccatiGains(RIGHT, np.eye(4)), 0.01 * np.eye(6)[None]
+    gains, noise = make_gains(RIGHT, np.eye(4)), 0.01 * np.eye(6)[None]
     motion = propagate(gains, np.ones((1, 6)), np.array([0.1]), noise)
     of_turning, of_driving = gains.motion_noise.factors.flat().shares
     np.testing.assert_allclose(of_turning + of_driving, motion.noise)

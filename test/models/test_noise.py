@@ -12,6 +12,7 @@ import random_runs
 from strategies import generators
 
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     flatten,
@@ -19,7 +20,6 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.filter.flat_arrays import Interval
-from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.models.held_velocities import HeldVelocities
 from slam_observer_ros.models.motion_noise import MotionNoise
@@ -181,7 +181,7 @@ def test_before_the_first_velocity_there_is_a_gap_at_the_latest_stamp_as_well():
 @given(generators())
 def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
     settings = Settings(angular_velocity_noise=(0.01,) * 3, linear_velocity_noise=(0.02,) * 3)
-    pieces, dt_s, gains = 5, 0.01, RiccatiGains(settings, np.eye(4))
+    pieces, dt_s, gains = 5, 0.01, make_gains(settings, np.eye(4))
     V = rng.normal(size=(pieces, 6))
     whole = Interval(0, round(1e9 * pieces * dt_s), 0, 0, None)
 

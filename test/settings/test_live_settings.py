@@ -205,9 +205,9 @@ def test_all_hypotheses_follow_a_change():
     estimator.change_settings(replace(settings, huber_threshold=0.5, rejection_threshold=3.0))
     for hypothesis in estimator._hypotheses._all:
         state = hypothesis.state
-        for owner in (state.gains, state.relinearisation):
-            assert owner._settings.huber_threshold == 0.5
-            assert owner._settings.rejection_threshold == 3.0
+        for settings_of in (state.gains._tuning, state.relinearisation._settings):
+            assert settings_of.huber_threshold == 0.5
+            assert settings_of.rejection_threshold == 3.0
         assert state.settings.rejection_threshold == 3.0
 
 

@@ -24,11 +24,11 @@ from strategies import generators
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.placement import make_gains
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.filter.arrays import FilterArrays
 from slam_observer_ros.filter.flat_arrays import Interval
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
-from slam_observer_ros.filter.riccati.riccati import RiccatiGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import PLANAR, SPATIAL
 from slam_observer_ros.models.calibration import Calibration
@@ -145,7 +145,7 @@ def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
     )
     V, dt_s = np.zeros((k, 6)), np.full(k, 0.2)
     V[:, axes.pose] = rng.normal(size=(k, d))
-    gains = RiccatiGains(replace(settings, two_d_mode=axes is PLANAR), np.eye(4))
+    gains = make_gains(replace(settings, two_d_mode=axes is PLANAR), np.eye(4))
     velocities = held(V, dt_s, random_covariances(rng, k, 6, 0.1))
 
     def keyframes(*cuts):
@@ -350,7 +350,7 @@ def test_where_all_is_linear_relinearising_changes_nothing(two_d_mode, max_landm
 )
 def test_it_relinearises_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
     settings = Settings(relinearization_interval=20, relinearization_angle=0.2)
-    riccati, before = RiccatiGains(settings, np.eye(4)), se3.exp(np.arange(6.0))
+    riccati, before = make_gains(settings, np.eye(4)), se3.exp(np.arange(6.0))
     riccati.add_known(KnownLandmarks(np.eye(3), np.tile(np.eye(3), (3, 1, 1))))
     relinearisation = Relinearisation(riccati.errors, riccati.calibration, settings)
     one_point = np.array([0]), np.eye(3)[:1], np.eye(3)[:1], np.eye(3)[None], np.array([np.inf])

@@ -74,7 +74,7 @@ class OrientationGains(Errors, Gains):
         entries = np.flatnonzero(np.repeat(kept, phi.shape[1]))
         weights = np.zeros(len(phi))
         weights[kept] = gated_weights(
-            phi[kept], predicted[np.ix_(entries, entries)], R[kept], self._settings
+            phi[kept], predicted[np.ix_(entries, entries)], R[kept], self._tuning
         )
         # K = P Hᵀ S⁻¹, X̂ ← exp(−K φ) · X̂
         used = weights > 0.0
@@ -107,7 +107,7 @@ class OrientationGains(Errors, Gains):
     def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
         """Take in orientations of a map, whose errors are independent of all else."""
         own = self.observer.orientations.are_known[rows] & (not self.observer.is_exact)
-        new, seen = ~own, self._settings.max_rejections
+        new, seen = ~own, self._tuning.max_rejections
         self.observer.orientations.put_known(rows[new], B[new], sigmas[new], seen)
         if self.observer.is_exact:
             return
@@ -118,7 +118,7 @@ class OrientationGains(Errors, Gains):
         known, R = rows[own], R[own]
         omega = self.axes.turns(so3.log(self.observer.orientations.B[known] @ transpose(B[own])))
         near = mahalanobis(omega, self.joint.own_turns(known) + R)
-        agree = accepted(near, self._settings.rejection_threshold)
+        agree = accepted(near, self._tuning.rejection_threshold)
         if agree.any():
             self.joint.activate(known[agree])
             HP, HPH = self.joint.project_own_turns(known[agree])
@@ -152,7 +152,7 @@ class OrientationGains(Errors, Gains):
         if known.joint is None:
             self.know_orientations(rows[tags], R[tags], sigmas[tags])
         else:  # their errors have been taken in together with the positions' errors
-            seen = self._settings.max_rejections
+            seen = self._tuning.max_rejections
             self.observer.orientations.put_known(rows[tags], R[tags], sigmas[tags], seen)
 
     def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
@@ -163,14 +163,14 @@ class OrientationGains(Errors, Gains):
         # Orientations that only the map knows, …
         new, of_new = rows[in_map & ~own], copies[in_map & ~own]
         self.joint.copy_turns(of_new, new)
-        seen = self._settings.max_rejections
+        seen = self._tuning.max_rejections
         tags.put_known(new, tags.B[of_new], tags.map_sigmas[of_new], seen)
         # … and what both have, B̂_i B̂_jᵀ = exp(ω_i − ω_j), unless they contradict each other.
         rows, copies = rows[in_map & own], copies[in_map & own]
         omega = self.axes.turns(so3.log(tags.B[rows] @ transpose(tags.B[copies])))
         R = RESOLUTION_RAD**2 * np.tile(np.eye(self.axes.turn), (len(rows), 1, 1))
         near = distances(omega, self.joint.project_turn_differences(rows, copies)[1], R)
-        agree = accepted(near, self._settings.rejection_threshold)
+        agree = accepted(near, self._tuning.rejection_threshold)
         if agree.any():
             HP, HPH = self.joint.project_turn_differences(rows[agree], copies[agree])
             S = with_blocks(HPH, R[agree])

@@ -22,18 +22,20 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.filter import core, step
 from slam_observer_ros.filter.arrays import UNKNOWN_RAD
 from slam_observer_ros.filter.chart import Chart
-from slam_observer_ros.filter.flat_arrays import Limits, Observed, Seen
+from slam_observer_ros.filter.flat_arrays import Limits, Observed, Seen, Tuning
 from slam_observer_ros.filter.gains import OF_CONSTANT_GAINS, room_for
 from slam_observer_ros.filter.joint_covariance import JointCovariance
 from slam_observer_ros.filter.known_landmarks import anchor, KnownLandmarks
 from slam_observer_ros.filter.landmark_table import Landmarks
+from slam_observer_ros.filter.observer import Observer
 from slam_observer_ros.filter.riccati.active_landmarks import BlockSize
 from slam_observer_ros.filter.riccati.covariances import CompressedCovariance, ExactMapCovariance
 from slam_observer_ros.filter.riccati.orientation_gains import OrientationGains
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import block_diagonal, solve_symmetric
+from slam_observer_ros.models.calibration import Calibration
+from slam_observer_ros.models.motion_noise import MotionNoise
 from slam_observer_ros.models.point_noise import PointFigures
-from slam_observer_ros.settings.estimator_settings import Settings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -51,15 +53,22 @@ class RiccatiGains(OrientationGains):
     """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
 
     ignores = OF_CONSTANT_GAINS
+    estimates_calibration = True
     block = BlockSize()  # of large maps
 
-    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
-        super().__init__(settings, reference_pose)
+    def __init__(
+        self,
+        tuning: Tuning,
+        observer: Observer,
+        calibration: Calibration,
+        motion_noise: MotionNoise,
+    ) -> None:
+        super().__init__(tuning, observer, calibration, motion_noise)
         # Beside its position a landmark's velocity is estimated, or the orientation of a tag at
         # rest; both are unknown at first.
-        speed = settings.landmark_velocity_stddev
+        speed = tuning.landmark_velocity_stddev
         velocity = self.axes.point if speed else 0
-        has_turns = settings.use_tag_orientation and not speed
+        has_turns = tuning.use_tag_orientation and not speed
         axes = self.axes if has_turns else self.axes.of_points()
         unknown = [UNKNOWN_RAD] * axes.turn + [speed] * velocity
         joint = JointCovariance(
@@ -69,11 +78,6 @@ class RiccatiGains(OrientationGains):
             np.array(unknown) ** 2,
         )
         self.joint = joint
-
-    @staticmethod
-    def estimated(settings: Settings) -> Settings:
-        """Return the settings: all of a calibration is estimated."""
-        return settings
 
     def copy(self) -> Self:
         """Return an independent copy."""
@@ -269,7 +273,7 @@ class RiccatiGains(OrientationGains):
         # Tags count by their columns: relinearising ends there, too.
         count = (len(self.observer.y_ref) + added) * self.joint.chart.stride / self.axes.point
         is_large = count > self.block.dense
-        may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
+        may_move = self.joint.chart.velocity > 0 or self.observer.have_moved
         if self.joint.is_dense and is_large and not may_move:
             self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
