@@ -13,7 +13,7 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recordings.trajectory import interpolate, Trajectory
 from slam_observer_ros.runs.metrics import (
     ConfigurationError,
-    landmark_errors,
+    landmark_rmse_m,
     trajectory_errors,
 )
 
@@ -59,7 +59,7 @@ def score(run: Run, world: World, has_ids: bool = True) -> Scores:
         _configuration_rmse_m(compared, world),
         errors.ate_rmse_m,
         errors.heading_rmse_rad,
-        landmark_errors(final.ids, final.world_points, world.landmarks_at(final.stamp_ns)).rmse_m
+        landmark_rmse_m(final.ids, final.world_points, world.landmarks_at(final.stamp_ns))
         if has_ids
         else float('nan'),
         run.cpu_s,

@@ -137,8 +137,7 @@ class Outcomes(Counter[str]):
         return [Outcome(t, i, what) for what, ids, t in kept for i in ids.tolist()]
 
 
-DELAY_NAME = 'velocity_delay'
-"""Name of the delay of velocities."""
+DELAY_NAME = 'velocity_delay'  # name of the delay of velocities
 
 
 def used_points(counts: Counter[str]) -> int:
@@ -345,9 +344,3 @@ class Innovations:
         """(m,) lengths of the residuals, metres."""
         lengths: FloatArray = np.linalg.norm(self.residuals, axis=1)
         return lengths
-
-    @property
-    def mean_nis(self) -> float | None:
-        """NIS per degree of freedom over the run, 1 is consistent; None if none is known."""
-        total = int(self.degrees_of_freedom.sum())
-        return float(np.nansum(self.nis) / total) if total else None

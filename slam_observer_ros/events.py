@@ -21,8 +21,7 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.matrices import limited, MAX_DEVIATION
 from slam_observer_ros.lie.sensor_mounting import Sensed
 
-UNKNOWN_ID = -1
-"""Landmark id of a point that its sensor could not identify."""
+UNKNOWN_ID = -1  # landmark id of a point that its sensor could not identify
 
 IMPOSSIBLE_ID = -(2**31)
 """Landmark id of a point whose message has a number there that can't be one: it is not used."""

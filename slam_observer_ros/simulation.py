@@ -21,11 +21,8 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.recordings.trajectory import LandmarkTruth, PoseTruth
 from slam_observer_ros.settings.parameter_table import parameter
 
-BODY_VELOCITY = (0.0, 0.0, 0.2, 1.0, 0.0, 0.0)
-"""Section VI's (Ω, v), rad/s and m/s, body frame."""
-
-LAP_S = 2.0 * math.pi / BODY_VELOCITY[2]
-"""Duration of one lap of the circle, seconds."""
+BODY_VELOCITY = (0.0, 0.0, 0.2, 1.0, 0.0, 0.0)  # section VI's (Ω, v), rad/s and m/s, body frame
+LAP_S = 2.0 * math.pi / BODY_VELOCITY[2]  # duration of one lap of the circle, seconds
 
 START_POSITION = (0.0, -BODY_VELOCITY[3] / BODY_VELOCITY[2], 2.0)
 """Start, metres; heading along +x from there, the circle is centred above the origin."""
@@ -33,8 +30,7 @@ START_POSITION = (0.0, -BODY_VELOCITY[3] / BODY_VELOCITY[2], 2.0)
 PAPER_DIRECTIONS = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0))
 """Directions of section VI's four landmarks from the origin."""
 
-LANDMARK_LOOP_RADIUS_M = 1.0
-"""Radius of the horizontal circle on which a moving landmark runs."""
+LANDMARK_LOOP_RADIUS_M = 1.0  # radius of the horizontal circle on which a moving landmark runs
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,8 +71,7 @@ _KNOWN = {row.name: row for row in (*table(InputSettings), *table(Settings))}
 
 _ID_DIGITS = 16
 
-Point = dict[str, Value]
-"""Values of the parameters of ``--grid``, by name."""
+Point = dict[str, Value]  # values of the parameters of ``--grid``, by name
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +96,7 @@ class Job:
 
 Failure = dict[str, object]
 
-REPORTS, TRAJECTORIES = 'reports', 'trajectories'
-"""Folders of ``--out`` for files of the runs."""
+REPORTS, TRAJECTORIES = 'reports', 'trajectories'  # folders of ``--out`` for files of the runs
 
 
 def do(out: Path, writes_reports: bool, writes_trajectories: bool, version: str, job: Job) -> Line:
@@ -443,8 +441,7 @@ def _fault_of(line: object) -> str:
     return f"'{wrong[0]}' is no file" if wrong else ''
 
 
-CONNECT_S = 10.0
-"""How long the scheduler of a cluster may take to answer."""
+CONNECT_S = 10.0  # how long the scheduler of a cluster may take to answer
 
 _Job = TypeVar('_Job')
 _Result = TypeVar('_Result')

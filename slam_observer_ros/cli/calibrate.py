@@ -309,11 +309,8 @@ def _write(args: argparse.Namespace, given: Given, result: _Calibration) -> None
     write_found(args.out, head, given.values, result.stated.groups)
 
 
-MUCH = 0.9
-"""Correlation beyond which two values trade."""
-
-WELL_KNOWN = 0.1
-"""Standard deviation over that at the start, below which nobody minds."""
+MUCH = 0.9  # correlation beyond which two values trade
+WELL_KNOWN = 0.1  # standard deviation over that at the start, below which nobody minds
 
 _WORDS = {
     'range_scale': 'range scale',
@@ -385,14 +382,9 @@ def _entry_of(name: str) -> Entry:
     return next(entry for entry in (*OF_VELOCITY, *OF_SENSOR) if entry.name == name)
 
 
-SEEN = 0.5
-"""Standard deviation over that at the start up to which something was seen of a value."""
-
-OFF = 3.0
-"""Standard deviations from where it was stated beyond which a value is off."""
-
-CLEARLY_NOISIER = math.log(1.2)
-"""Logarithm of a factor of noise from which it is worth a change."""
+SEEN = 0.5  # standard deviation over that at the start up to which something was seen of a value
+OFF = 3.0  # standard deviations from where it was stated beyond which a value is off
+CLEARLY_NOISIER = math.log(1.2)  # logarithm of a factor of noise from which it is worth a change
 
 MOUNT = ('sensor_rotation', 'sensor_translation')
 

@@ -82,8 +82,7 @@ def _bounds(row: Parameter) -> dict[str, object]:
     return {name: bound for name, bound in bounds.items() if math.isfinite(bound)}
 
 
-ROWS = (*table(ObserverNodeSettings), *table(Settings))
-"""All parameters of ``observer_node``."""
+ROWS = (*table(ObserverNodeSettings), *table(Settings))  # all parameters of ``observer_node``
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -132,8 +132,7 @@ def _run_tum(args: argparse.Namespace) -> None:
     print_table(str(args.output), {'topic': str(topic), 'poses': str(len(trajectory))})
 
 
-SURVEY_M = 0.05
-"""Standard deviation of coordinates of Plaza's radios, which were surveyed by GPS."""
+SURVEY_M = 0.05  # standard deviation of coordinates of Plaza's radios, which were surveyed by GPS
 
 
 def surveyed(landmarks: LandmarkTruth) -> LandmarkMap:

@@ -49,8 +49,7 @@ from slam_observer_ros.settings.parameter_table import from_parameters, table
 LISTENER = 'slam_observer_ros.nodes.live_inputs'
 """The program that hears topics; it is one of its own, as only ``nodes/`` knows ROS."""
 
-PATIENCE_S = 20.0
-"""Time for that to start and to end, beyond the time of listening."""
+PATIENCE_S = 20.0  # time for that to start and to end, beyond the time of listening
 
 COMMON_PACKAGES = ('geometry_msgs', 'nav_msgs', 'sensor_msgs')
 """Packages of messages that every ROS has."""
@@ -171,21 +170,18 @@ def _topics(seconds: float) -> list[dict[str, Any]]:
     return heard
 
 
-MOST_EVENTS = 60_000
-"""Events of a recording that are looked at, from its start."""
+MOST_EVENTS = 60_000  # events of a recording that are looked at, from its start
 
 REPEATED = 0.5
 """Share of the velocities that are exactly the one before beyond which they are commands."""
 
 
-FEW = 50
-"""Points of an observation, in the median, up to which they are landmarks and no raw scan."""
+FEW = 50  # points of an observation, in the median, up to which they are landmarks and no raw scan
 
 FAR_M = 5.0
 """Range beyond which a camera reads hardly a tag; a laser sees most of its reflectors there."""
 
-FAR_SHARE = 0.25
-"""Share of the points that are so far where a laser scanner sees them."""
+FAR_SHARE = 0.25  # share of the points that are so far where a laser scanner sees them
 
 
 def shipped_settings(name: str) -> Settings:

@@ -45,8 +45,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-MAX_LISTED = 20
-"""Most names that a warning gives."""
+MAX_LISTED = 20  # most names that a warning gives
 
 _PACKAGE = 'slam_observer_ros'
 _ESTIMATOR_NAMES = frozenset(row.name for row in table(Settings))
@@ -338,7 +337,7 @@ def read_request(args: argparse.Namespace, given: Given, recording: Path) -> Req
     }
     values |= {name: value for name, value in options.items() if value is not None}
     inputs = from_parameters(InputSettings, values).with_plain_frames()
-    return Request(recording, settings, inputs, topics, args.load_map, args.smooth).checked()
+    return Request(recording, settings, inputs, topics, args.load_map, args.smooth)
 
 
 def warn_of_unused(args: argparse.Namespace, given: Given) -> None:

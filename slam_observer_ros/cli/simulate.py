@@ -110,13 +110,11 @@ def run_simulation(
     )
 
 
-START_NS = 1_000_000_000
-"""Stamp of the first event; ROS takes a stamp of zero for an unknown one."""
+START_NS = 1_000_000_000  # stamp of the first event; ROS takes a stamp of zero for an unknown one
 
 MAX_STEP_S = 10.0
 
-MAX_STEPS = 10_000_000
-"""More of them take days."""
+MAX_STEPS = 10_000_000  # more of them take days
 
 FIGURES = ('lyapunov', 'configuration')
 

@@ -98,8 +98,7 @@ def failing(kind: type[SlamObserverError], what: str) -> Iterator[None]:
         raise kind(f'{what}: {error.strerror}') from error
 
 
-_LEAST = 1e-4
-"""Numbers below this have more zeros than anybody counts."""
+_LEAST = 1e-4  # numbers below this have more zeros than anybody counts
 
 
 def significant(value: float, digits: int = 3) -> str:

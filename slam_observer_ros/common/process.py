@@ -31,8 +31,7 @@ def use_one_thread() -> None:
         os.environ.update(dict.fromkeys(CHOICES, '1'))
 
 
-SIGNALLED = 128
-"""To which the number of the signal that ended the program is added, as shells do."""
+SIGNALLED = 128  # to which the number of the signal that ended the program is added, as shells do
 
 PATIENCE_S = 2.0
 """How long clearing away takes at most until the next signal ends the program at once."""

@@ -18,18 +18,13 @@ FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 """Array of int64: landmark ids, indices, stamps in nanoseconds."""
 
-BoolArray: TypeAlias = NDArray[np.bool_]
-"""Array of bool: masks over landmarks."""
-
-
-FIRST_AUTOMATIC_ID = 10_000_000
-"""Landmarks whose sensor gives no ids are numbered from here on."""
+BoolArray: TypeAlias = NDArray[np.bool_]  # array of bool: masks over landmarks
+FIRST_AUTOMATIC_ID = 10_000_000  # landmarks whose sensor gives no ids are numbered from here on
 
 LAST_AUTOMATIC_ID = 2**24 - 1
 """They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
 
-LEAST_ROOM = 16
-"""Rows for which there is room at first."""
+LEAST_ROOM = 16  # rows for which there is room at first
 
 
 class LandmarkColumns:

@@ -35,24 +35,16 @@ from slam_observer_ros.runs.result import Result
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import changed_names, table
 
-Json: TypeAlias = Any
-"""What json.dumps takes without NaN."""
-
-MAX_PATH = 4000
-"""Poses that are drawn, of the path and of its errors."""
+Json: TypeAlias = Any  # what json.dumps takes without NaN
+MAX_PATH = 4000  # poses that are drawn, of the path and of its errors
 
 MAX_GROUPS, MIN_GROUP = 150, 10
 """Points of the curve of NIS, and of how many observations each is the mean at least."""
 
 MAX_RESIDUALS = 6000
-MAX_ELLIPSES = 40_000
-"""Landmarks of all instants together that are drawn."""
-
-FLAT = 0.05
-"""Height of a map over its width, below which only its plan is drawn."""
-
-UPPER = np.triu_indices(3)
-"""Entries of a covariance that the page has: xx, xy, xz, yy, yz, zz."""
+MAX_ELLIPSES = 40_000  # landmarks of all instants together that are drawn
+FLAT = 0.05  # height of a map over its width, below which only its plan is drawn
+UPPER = np.triu_indices(3)  # entries of a covariance that the page has: xx, xy, xz, yy, yz, zz
 
 
 def write_report(path: Path, result: Result, title: str, rows: Mapping[str, str]) -> None:
@@ -377,11 +369,8 @@ def _calibration_curve(result: Result, name: str) -> dict[str, Json]:
 
 INDEX = 'index.html'
 
-Line = dict[str, Any]
-"""A run that is done, as the log has it."""
-
-FILES = ('report', 'trajectory')
-"""What may be written of a run; the line has where, or null."""
+Line = dict[str, Any]  # a run that is done, as the log has it
+FILES = ('report', 'trajectory')  # what may be written of a run; the line has where, or null
 
 SCORES = tuple(name for name in ACCURACY_ROWS if 'anees' not in name)
 """Figures whose least value is the best."""

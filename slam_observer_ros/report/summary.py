@@ -28,12 +28,8 @@ ACCURACY_ROWS = {
 }
 """Figures of ``--json`` that are in the table, their names there and their units."""
 
-FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')
-"""What runs are compared by."""
-
-
-NEARLY_ALL = 0.99
-"""Share of the trajectory that the truth covers, up to which it is printed."""
+FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')  # what runs are compared by
+NEARLY_ALL = 0.99  # share of the trajectory that the truth covers, up to which it is printed
 
 LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported', 'doubled')
 """What may happen to landmarks of the map; counted under these names."""

@@ -40,18 +40,12 @@ from slam_observer_ros.runs.result import Request
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.settings.parameter_table import table, Value
 
-Advance = Callable[[], None]
-"""Called at each run."""
-
-BLOCKS = 20
-"""Parts of a recording in time by which it is judged whether a gain may be chance."""
-
-SURE = 2.0
-"""Standard deviations by which the likelihood must grow."""
+Advance = Callable[[], None]  # called at each run
+BLOCKS = 20  # parts of a recording in time by which it is judged whether a gain may be chance
+SURE = 2.0  # standard deviations by which the likelihood must grow
 
 WORSE_ERROR = 1.05
-WORSE_CONSISTENCY = 1.5
-"""Factors by which the error, or how far the ANEES is from 1, may grow."""
+WORSE_CONSISTENCY = 1.5  # factors by which the error, or how far the ANEES is from 1, may grow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,8 +339,7 @@ def _mean_squares(V: FloatArray, count: int) -> FloatArray:
 DELAY_STEPS_S = (0.1, 0.05)
 """Steps by which the delay is searched, and its likelihood's curvature found."""
 
-MOSTLY_NOISE = 0.5
-"""Share of noise in a velocity beyond which nothing moves along its axis."""
+MOSTLY_NOISE = 0.5  # share of noise in a velocity beyond which nothing moves along its axis
 
 MAX_BEHIND = 0.01
 """Share of the points so far off the sensor's axis that it does not measure depth along that."""
@@ -559,18 +552,14 @@ def scaled(
     return replace(settings, **values)
 
 
-LARGEST = math.log(32.0)
-"""Logarithm of the factor by which a figure changes at most."""
+LARGEST = math.log(32.0)  # logarithm of the factor by which a figure changes at most
 
 FIRST_STEP = math.log(2.0)
 CURVATURE_STEP = 0.2
 """Steps of the search at first, and by which the curvature is measured, as logarithms."""
 
-EVALUATIONS = 12
-"""How often the likelihood is computed at most in the search, for each factor."""
-
-TOLERANCE = 0.03
-"""How near the factors come to the most likely ones, as a share."""
+EVALUATIONS = 12  # how often the likelihood is computed at most in the search, for each factor
+TOLERANCE = 0.03  # how near the factors come to the most likely ones, as a share
 
 NO_EFFECT = 0.1
 """Change of the log likelihood, by twice and by half the noise, below which a factor has none.
@@ -578,8 +567,7 @@ NO_EFFECT = 0.1
 The factor would be known to 20 times itself at best.
 """
 
-DIGITS = 3
-"""Significant digits of a noise figure; it is seldom known to so many."""
+DIGITS = 3  # significant digits of a noise figure; it is seldom known to so many
 
 Objective = Callable[[FloatArray], float]
 

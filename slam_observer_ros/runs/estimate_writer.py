@@ -37,8 +37,7 @@ logger = logging.getLogger(__name__)
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
-OVERVIEW_PERIOD_NS = 1_000_000_000
-"""Time between two maps, nanoseconds."""
+OVERVIEW_PERIOD_NS = 1_000_000_000  # time between two maps, nanoseconds
 
 ODOMETRY_TOPIC = '/observer_node/odometry'
 MAP_TOPIC = '/landmark_map'

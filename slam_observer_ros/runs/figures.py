@@ -66,8 +66,7 @@ LANDMARKS: Any = {
     'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5, 'label': 'estimated landmarks',
 }  # fmt: skip
 
-_PLANAR_RATIO = 0.01
-"""A scene lower than this part of its width is drawn from above."""
+_PLANAR_RATIO = 0.01  # a scene lower than this part of its width is drawn from above
 
 
 def is_flat(points: FloatArray) -> bool:

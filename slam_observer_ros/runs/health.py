@@ -34,8 +34,7 @@ from slam_observer_ros.estimator.estimate import Estimate
 from slam_observer_ros.lie.matrices import MAX_DEVIATION
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
-MAX_REJECTED = 0.1
-"""Share of the points beyond which they are more than a sensor's outliers."""
+MAX_REJECTED = 0.1  # share of the points beyond which they are more than a sensor's outliers
 
 MAX_REJECTED_ORIENTATIONS = 0.5
 """Share of the points beyond which they are more than the flips of small or frontal tags."""
@@ -73,15 +72,13 @@ HARDLY_ANY = 0.25
 IMPLAUSIBLE = 4.0
 """Stated standard deviations by which no calibration is off: something else is wrong."""
 
-NOTABLY_NOISIER = 1.5
-"""Factor of the noise of the odometry from which it is named as a problem."""
+NOTABLY_NOISIER = 1.5  # factor of the noise of the odometry from which it is named as a problem
 
 NOTABLY_WRONG, TOO_WRONG = math.sqrt(1.5), 2.0
 """Factors of the stated noise: what is worth a note, and what neither chance nor a sensor's usual
 correlation explains."""
 
-NOISELESS = 0.01
-"""Share of the stated noise below which there is none at all."""
+NOISELESS = 0.01  # share of the stated noise below which there is none at all
 
 MOUNTED = {
     'sensor_rotation': (
@@ -275,8 +272,7 @@ def of_fit(factor: float | None) -> list[Finding]:
 RECENT_INNOVATIONS = 300
 """Observations over which innovations are compared with the noise that is stated."""
 
-MIN_DEGREES = 100
-"""Degrees of freedom that it takes to say so; the factor is then known to 7 %."""
+MIN_DEGREES = 100  # degrees of freedom that it takes to say so; the factor is then known to 7 %
 
 
 class NoiseFit:
@@ -347,17 +343,10 @@ def of_stamps(unstamped: Counter[str]) -> list[Finding]:
     return rule(count > 0, 'zero_stamps', topics=', '.join(unstamped), count=count)
 
 
-SILENT_S = 2.0
-"""An input without messages for this long is a warning."""
-
-MIN_POINTS = 50
-"""Points that it takes to say how large a share of them is rejected."""
-
-MANY_EMPTY = 200
-"""Messages without a landmark, that are no detector that waits for one."""
-
-MANY_UNUSED = 20
-"""Messages, none of which was used, that are no transient of the start."""
+SILENT_S = 2.0  # an input without messages for this long is a warning
+MIN_POINTS = 50  # points that it takes to say how large a share of them is rejected
+MANY_EMPTY = 200  # messages without a landmark, that are no detector that waits for one
+MANY_UNUSED = 20  # messages, none of which was used, that are no transient of the start
 
 USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
 """Inputs, and what their messages are counted as when they are used."""
@@ -506,11 +495,8 @@ def of_twist(topic: str, problem: str) -> Finding:
     return found('wrong_twist' if problem else 'zero_twist', topic=topic, problem=problem)
 
 
-BEHIND_S = 0.3
-"""Messages that wait for less, as while a map is loaded, are no matter."""
-
-LASTING_S = 2.0
-"""How long messages have to wait for more than that before it is reported."""
+BEHIND_S = 0.3  # messages that wait for less, as while a map is loaded, are no matter
+LASTING_S = 2.0  # how long messages have to wait for more than that before it is reported
 
 
 class Backlog:
@@ -547,8 +533,7 @@ class Backlog:
 MIN_PERIOD_S = 2.0
 """Time over which it is seen how much is dropped: who was busy for a moment does keep up."""
 
-MANY_SHED = 0.1
-"""Share of the messages from which on it is reported."""
+MANY_SHED = 0.1  # share of the messages from which on it is reported
 
 
 def overload(topic: str, read: int, shed: int, period_s: float) -> str:
@@ -559,8 +544,7 @@ def overload(topic: str, read: int, shed: int, period_s: float) -> str:
     return fault('overload', topic=topic, rate_hz=rate_hz, used_hz=used_hz)
 
 
-SAMPLES = 11
-"""Messages whose median offset is looked at: five stragglers in a row change nothing."""
+SAMPLES = 11  # messages whose median offset is looked at: five stragglers in a row change nothing
 
 FUTURE_NS = 50_000_000
 """Stamps that are further ahead of their reception can only be of another clock, nanoseconds."""

@@ -26,8 +26,7 @@ from slam_observer_ros.recordings.trajectory import (
     Trajectory,
 )
 
-MIN_POSES = 3
-"""Fewer positions can be aligned without an error left."""
+MIN_POSES = 3  # fewer positions can be aligned without an error left
 
 
 def root_mean_square(errors: FloatArray) -> float:
@@ -121,37 +120,17 @@ def pose_errors(poses: FloatArray, true_poses: FloatArray) -> FloatArray:
     return np.concatenate([so3.log(R_error), poses[..., :3, 3] - true_poses[..., :3, 3]], axis=-1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LandmarkErrors:
-    """Errors of a map after one rigid alignment of the landmarks whose truth is known.
+def landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: LandmarkTruth) -> float:
+    """Return the RMSE of a map's landmarks (n,) whose truth is known, after rigid alignment.
 
-    ``errors`` (m, 3) are aligned estimate minus truth, metres, of the landmarks ``ids`` (m,) in
-    both maps; ``alignment`` (4, 4) leads from the estimate's world to the truth's.
-    """
-
-    ids: IntArray
-    alignment: FloatArray
-    errors: FloatArray
-
-    @property
-    def rmse_m(self) -> float:
-        """RMSE of the landmark positions, metres."""
-        return root_mean_square(self.errors)
-
-
-def landmark_errors(
-    ids: IntArray, world_points: FloatArray, truth: LandmarkTruth
-) -> LandmarkErrors:
-    """Compare a map, of ids (n,) that are each there once, with the truth after rigid alignment.
-
-    Raises an EvaluationError if no landmark is in both maps.
+    Each of the ids is there once. Raises an EvaluationError if no landmark is in both maps.
     """
     common, rows, true_rows = np.intersect1d(ids, truth.ids, return_indices=True)
     if len(common) == 0:
         raise EvaluationError('no landmark is in both the estimated map and the true one')
     points, true_points = world_points[rows], truth.world_points[true_rows]
     alignment = rigid_alignment(points, true_points)
-    return LandmarkErrors(common, alignment, se3.transform(alignment, points) - true_points)
+    return root_mean_square(se3.transform(alignment, points) - true_points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,8 +160,7 @@ def fit_decay(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> Decay 
 MAX_JOINT = 100
 """Landmarks whose errors are normalised together, at most: it costs the cube of them."""
 
-ROUNDING = 1e-13
-"""Share of the total variance that rounding may have left out of a direction."""
+ROUNDING = 1e-13  # share of the total variance that rounding may have left out of a direction
 
 
 @dataclass(slots=True)
@@ -271,8 +249,7 @@ def _nees(errors: FloatArray, P: FloatArray) -> float:
 MAX_SHARE_OF_ANCHOR = 0.1
 """ANEES that the anchor's own error may make up at most; 1 is what all errors together have."""
 
-_SINGULAR = 1e-12
-"""Eigenvalues of a correlation matrix below this are zero but for rounding."""
+_SINGULAR = 1e-12  # eigenvalues of a correlation matrix below this are zero but for rounding
 
 
 def normalised_squared_errors(

@@ -162,8 +162,7 @@ PAIRS = tuple(
 DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
 """Time of driving, and turns, that are looked at: who stands or goes straight on says little."""
 
-MOST_S = 300.0
-"""Time in all, at most."""
+MOST_S = 300.0  # time in all, at most
 
 LONGER = 2.0
 """How many times as much is looked at where less leaves it open whether a mistake was made."""
@@ -240,8 +239,7 @@ class Drive:
         self._last = event
 
 
-OUT_OF_PLANE = 0.1
-"""Share of turning or of speed beyond which a robot is not on a floor."""
+OUT_OF_PLANE = 0.1  # share of turning or of speed beyond which a robot is not on a floor
 
 
 def is_flat(velocities: FloatArray) -> bool:
@@ -263,8 +261,7 @@ def never_turns(events: Iterable[Event]) -> bool:
 Maps: TypeAlias = LandmarkMap | Sequence[LandmarkMap]
 T = TypeVar('T')
 
-SURE, CLEAR = 25.0, 0.05
-"""ln of how many times likelier all points must be, and each on average."""
+SURE, CLEAR = 25.0, 0.05  # ln of how many times likelier all points must be, and each on average
 
 LIKELIER = math.log(20.0)
 """The same for all points, of a correction that more of the drive may show to be right."""
@@ -288,8 +285,7 @@ NOTABLE_TURN_RAD = 1.0
 UNKNOWN_TURN = 1.0
 """Noise of a turning that is not known, rad/√s: robots turn by about one radian in a second."""
 
-ROUGHLY = 0.2
-"""Deviation of a scale that is known to the next of the sizes that are tried."""
+ROUGHLY = 0.2  # deviation of a scale that is known to the next of the sizes that are tried
 
 EARLY, TRIED = 1.0 / 3.0, 3
 """Part of the drive by which corrections are chosen that are tried on the whole, and how many."""

@@ -22,8 +22,7 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.recordings.trajectory import Trajectory
 
-SAMPLE_PERIOD_NS = 50_000_000
-"""Least time between two poses of a sampled trajectory."""
+SAMPLE_PERIOD_NS = 50_000_000  # least time between two poses of a sampled trajectory
 
 
 class PoseSamples:
@@ -68,8 +67,7 @@ class PoseSamples:
         return np.array([latest[stamp_ns] for stamp_ns in sorted(latest)])
 
 
-MOST_PENDING = 64
-"""Motions that are worked off at once: one by one costs three times as much."""
+MOST_PENDING = 64  # motions that are worked off at once: one by one costs three times as much
 
 
 class DeadReckoning:
@@ -119,15 +117,12 @@ FIRST_PERIOD_NS = 250_000_000
 """Time between two instants at first; it doubles whenever there are too many of them."""
 
 MAX_INSTANTS = 600
-MAX_LANDMARKS_KEPT = 100_000
-"""Landmarks of all instants together."""
-
-LATELY_NS = 1_000_000_000
-"""How long ago an observation may be that an instant shows."""
+MAX_LANDMARKS_KEPT = 100_000  # landmarks of all instants together
+LATELY_NS = 1_000_000_000  # how long ago an observation may be that an instant shows
 
 
 class NisTally:
-    """Sums up the normalised innovations of a run, and keeps nothing else of it."""
+    """Sums up the normalised innovations of a run."""
 
     def __init__(self) -> None:
         self.clear()
@@ -145,28 +140,27 @@ class NisTally:
 
     @property
     def mean_nis(self) -> float | None:
-        """As :attr:`.Innovations.mean_nis`."""
+        """NIS per degree of freedom over the run, 1 is consistent; None if none is known."""
         total = self._degrees_of_freedom
         return self._nis / total if total else None
 
 
-class RunRecorder:
-    """Notes instants and innovations of a run while it goes on, as a page shows them.
+class RunRecorder(NisTally):
+    """Notes instants and innovations of a run while it goes on, too, as a page shows them.
 
     Memory and time are bounded: as a run grows longer, instants lie further apart.
     """
 
-    def __init__(self) -> None:
-        self.clear()
-
     def clear(self) -> None:
         """Forget all: the run has started again."""
+        super().clear()
         self._instants: list[Instant] = []
         self._updates: list[Update] = []
         self._period_ns = FIRST_PERIOD_NS
 
     def note_update(self, update: Update) -> None:
         """Take in an observation, whose innovation the estimator has judged."""
+        super().note_update(update)
         if len(update.ids):
             self._updates.append(update)
 
@@ -190,11 +184,6 @@ class RunRecorder:
         if estimator.stamp_ns is not None and estimator.is_localised:
             by_stamp[estimator.stamp_ns] = _instant(estimator, estimator.stamp_ns)
         return tuple(by_stamp[stamp_ns] for stamp_ns in sorted(by_stamp))
-
-    @property
-    def mean_nis(self) -> float | None:
-        """As :attr:`.Innovations.mean_nis`."""
-        return self.innovations.mean_nis
 
     @property
     def innovations(self) -> Innovations:

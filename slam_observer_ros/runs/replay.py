@@ -35,7 +35,7 @@ from slam_observer_ros.runs.estimate_writer import estimate_writer
 from slam_observer_ros.runs.metrics import (
     anchored_average_nees,
     ConfigurationError,
-    landmark_errors,
+    landmark_rmse_m,
     trajectory_errors,
     TrajectoryErrors,
 )
@@ -79,7 +79,8 @@ def result_of(
         events: Events = recording.blocks(selected, inputs, settings.velocity_timeout)
         if show_progress is not None:
             events = show_progress(events, recording.event_count(selected))
-        tally, notes = NisTally(), RunRecorder()
+        notes = RunRecorder()
+        tally = notes if request.keeps_run else NisTally()
         needs_poses = request.keeps_poses or request.keeps_run or len(truth.stamps_ns) > 0
 
         def look_for_mistakes() -> list[Finding]:
@@ -90,7 +91,7 @@ def result_of(
 
         with estimate_writer(request, recording, selected, inputs, map_frame) as writer:
             recorders: list[Recorder] = [] if writer is None else [writer]
-            recorders += [notes] if request.keeps_run else [tally] if request.keeps_nis else []
+            recorders += [tally] if request.keeps_run or request.keeps_nis else []
             run = replay(events, settings, truth, maps or None, needs_poses, recorders)
             unused = list(of_use(recording, selected, inputs, run))
             needs_some = request.smooth or request.keeps_map or map_path is not None
@@ -112,7 +113,7 @@ def result_of(
                 recording.contents.missing_ids(selected.landmarks),
                 recording.loss,
                 map_frame,
-                notes.innovations.mean_nis if request.keeps_run else tally.mean_nis,
+                tally.mean_nis,
                 notes.innovations,
                 notes.finish(run.estimator) if request.keeps_run else (),
             )
@@ -385,7 +386,7 @@ def measure(run: Replay, truth: Truth) -> Accuracy:
     errors = (
         _pose_errors('trajectory', run.trajectory, pose_truth),
         _pose_errors('dead reckoning', run.dead_reckoning, pose_truth),
-        _landmark_rmse_m(estimator.landmark_ids, estimator.world_points, truth),
+        _map_rmse_m(estimator.landmark_ids, estimator.world_points, truth),
     )
     anees = None
     if not run.in_known_map and (covariances := run.pose_covariances) is not None:
@@ -416,15 +417,12 @@ def smoothed_run(run: Replay, truth: Truth) -> SmoothedRun:
         trajectory,
         _pose_errors('smoothed trajectory', trajectory, truth.trajectory),
         _pose_errors('trajectory before smoothing', before, truth.trajectory),
-        _landmark_rmse_m(smoothed.ids, smoothed.world_points, truth),
+        _map_rmse_m(smoothed.ids, smoothed.world_points, truth),
     )
 
 
 def smoothed_trajectory(
-    smoothed: Smoothed,
-    stamps_ns: IntArray,
-    dead_reckoning: Trajectory,
-    estimator: Estimate,
+    smoothed: Smoothed, stamps_ns: IntArray, dead_reckoning: Trajectory, estimator: Estimate
 ) -> Trajectory:
     """Return the smoothed poses at any stamps (m,), such as the online trajectory's.
 
@@ -458,11 +456,11 @@ def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> Trajecto
     return None
 
 
-def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
+def _map_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
     if truth.landmarks is None or (len(ids) and is_automatic(ids).all()):
         return None  # landmarks without ids of their own have no counterpart
     with _unknown_if_unfit('uncompared', figure='map'):
-        return landmark_errors(ids, world_points, truth.landmarks).rmse_m
+        return landmark_rmse_m(ids, world_points, truth.landmarks)
     return None
 
 

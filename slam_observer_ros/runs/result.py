@@ -70,6 +70,11 @@ class Request:
     with_inputs: bool = False
     overwrite: bool = False
 
+    def __post_init__(self) -> None:
+        """Raise a UsageError if it is to smooth with gains that can't."""
+        if self.smooth:
+            self.need_errors('--smooth')
+
     def with_values(self, values: Mapping[str, Value]) -> Request:
         """Return the same with other values of some parameters."""
         of_inputs: dict[str, Any] = {n: v for n, v in values.items() if n in INPUT_NAMES}
@@ -78,13 +83,7 @@ class Request:
             self,
             settings=replace(self.settings, **others),
             inputs=replace(self.inputs, **of_inputs).with_plain_frames(),
-        ).checked()
-
-    def checked(self) -> Request:
-        """Return itself; a UsageError is raised if it is to smooth with gains that can't."""
-        if self.smooth:
-            self.need_errors('--smooth')
-        return self
+        )
 
     def need_errors(self, what: str) -> None:
         """Raise a UsageError unless its gains know their errors, which ``what`` needs."""
@@ -183,11 +182,8 @@ class SmoothedRun:
     landmark_rmse_m: float | None
 
 
-MALFORMED = 'malformed'
-"""Reason under which messages that can't be decoded are counted."""
-
-MIN_GAP_S = 3.0
-"""Shortest stretch without a used landmark that is marked."""
+MALFORMED = 'malformed'  # reason under which messages that can't be decoded are counted
+MIN_GAP_S = 3.0  # shortest stretch without a used landmark that is marked
 
 
 def list_dropped(dropped: Mapping[str, int]) -> str:

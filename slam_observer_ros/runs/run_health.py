@@ -106,8 +106,7 @@ PLACE_THE_SENSOR = (
 
 MAX_CLOCK_OFFSET_S = ObserverNodeSettings.max_clock_offset
 
-MAX_AHEAD_S = 0.05
-"""A message can be late, but not early."""
+MAX_AHEAD_S = 0.05  # a message can be late, but not early
 
 MAX_SILENCE = 0.1
 """Share of the time beyond which velocities that are missing are more than a pause."""
@@ -115,8 +114,7 @@ MAX_SILENCE = 0.1
 MAX_END_SILENCE = 1.0 / 3.0
 """Share of the time after which landmarks that come no more are more than out of view."""
 
-FEWEST = 10
-"""Messages that a topic of landmarks has at least if it can be said to have ended."""
+FEWEST = 10  # messages that a topic of landmarks has at least if it can be said to have ended
 
 
 def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[str]:
@@ -253,28 +251,18 @@ def of_clocks(recording: Recording, selected: SelectedTopics) -> Iterator[Findin
 
 
 MAX_GROWTHS = 3
-GROWTH_SHARE = 0.25
-"""Part of the largest error that a growth must reach to be named."""
-
-NOTABLE_GAP_S = 0.5
-"""Time without a used landmark that is named where the error grew."""
-
-MAX_ANEES = 1.5
-"""ANEES beyond which the noise that is stated does not fit."""
+GROWTH_SHARE = 0.25  # part of the largest error that a growth must reach to be named
+NOTABLE_GAP_S = 0.5  # time without a used landmark that is named where the error grew
+MAX_ANEES = 1.5  # ANEES beyond which the noise that is stated does not fit
 
 WINDOW_NS = 5 * NANOSECONDS_PER_SECOND
 """Motions that are compared: long enough that the truth's own noise is small beside theirs."""
 
 MIN_WINDOWS = 20
 
-TOO_LITTLE = 1.5
-"""Errors over what is stated, beyond which a noise figure is named."""
-
-LONG_S = 1.0
-"""Time without landmarks after which an innovation is mostly due to the motion."""
-
-MIN_DEGREES = 60
-"""Degrees of freedom of innovations whose mean says something."""
+TOO_LITTLE = 1.5  # errors over what is stated, beyond which a noise figure is named
+LONG_S = 1.0  # time without landmarks after which an innovation is mostly due to the motion
+MIN_DEGREES = 60  # degrees of freedom of innovations whose mean says something
 
 
 def of_errors(result: Result) -> Iterator[Finding]:

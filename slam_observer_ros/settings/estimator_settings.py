@@ -9,14 +9,12 @@ from slam_observer_ros.settings.parameter_table import parameter, Pose6
 Vector3 = tuple[float, float, float]
 
 
-MAX_DELAY_S = 1.0
-"""Delay of velocities that is made up for at most."""
+MAX_DELAY_S = 1.0  # delay of velocities that is made up for at most
 
 ERROR_PROBABILITY = 1e-3
 """How likely the place where points without id fit in a loaded map may be wrong."""
 
-MAX_POSITION_M = 1e7
-"""Coordinate of a given pose at most: a map's origin may be UTM's."""
+MAX_POSITION_M = 1e7  # coordinate of a given pose at most: a map's origin may be UTM's
 
 
 @dataclass(frozen=True)

@@ -87,14 +87,9 @@ def _import_decoders() -> None:
         import_module(f'{_PACKAGE}.{module.name}')
 
 
-AUTO = 'auto'
-"""Message type parameter: take the type that is found on the topic."""
-
-ON_TF = 'tf'
-"""Landmarks are fiducials whose positions, and ids in the names of frames, are on /tf."""
-
-POSE_DIFFERENCES = 'pose_differences'
-"""Velocity source: the differences of an odometry's poses."""
+AUTO = 'auto'  # message type parameter: take the type that is found on the topic
+ON_TF = 'tf'  # landmarks are fiducials whose positions, and ids in the names of frames, are on /tf
+POSE_DIFFERENCES = 'pose_differences'  # velocity source: the differences of an odometry's poses
 
 InputSettingsT = TypeVar('InputSettingsT', bound='InputSettings')
 

@@ -18,11 +18,8 @@ from slam_observer_ros.settings.parameter_table import (
 
 OBSERVER_NODE = 'observer_node'
 
-MAX_BYTES = 256_000
-"""Largest file that is read; whole robots' have a tenth of it."""
-
-MAX_NAME = 255
-"""Longest name of a node with its namespaces, as in ROS, and of a parameter."""
+MAX_BYTES = 256_000  # largest file that is read; whole robots' have a tenth of it
+MAX_NAME = 255  # longest name of a node with its namespaces, as in ROS, and of a parameter
 
 _ROS_FLOAT = re.compile(r'[-+]?(?:\d+\.?\d*[eE][-+]?\d+|\.\d+(?:[eE][-+]?\d+)?)')
 
