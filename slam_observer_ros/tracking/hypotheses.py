@@ -167,21 +167,21 @@ class Hypotheses:
         for hypothesis in list(self._all):
             most = hypothesis.state.settings.rejection_threshold**2 / hypothesis.state.axes.point
             while (ways := find(hypothesis.state, hypothesis.apart)) and len(ways[0].rows):
-                ids = hypothesis.state.landmarks.ids
+                ids, followed = hypothesis.state.landmarks.ids, [hypothesis]
                 pairs = [_pairs(ids, way) for way in ways]
+                apart = hypothesis.apart.union(*pairs)
                 others = [hypothesis.copy() for _ in ways[1:]]
                 for one, way, own in zip((hypothesis, *others), ways, pairs, strict=True):
-                    one.apart |= frozenset().union(*pairs) - own
-                    one.cost += way.cost
                     # Of three that are one, two at first; each per axis at the gate.
                     first = ~np.isin(way.rows, way.copies)
                     rows, copies = way.rows[first], way.copies[first]
-                    if len(rows) and one.state.merge(rows, copies, most) > most:
-                        one.apart |= own
-                if others:
-                    stamp_ns = int(hypothesis.state.landmarks.last_seen_ns.max())
-                    _part((hypothesis, *others), stamp_ns)
-                    self._all += others
+                    fits = not len(rows) or one.state.merge(rows, copies, most) <= most
+                    one.apart, one.cost = apart - own if fits else apart, one.cost + way.cost
+                    if fits and one is not hypothesis:
+                        followed.append(one)
+                if len(followed) > 1:
+                    _part(followed, int(hypothesis.state.landmarks.last_seen_ns.max()))
+                    self._all += followed[1:]
         self._go_on_with(sorted(self._all, key=lambda one: one.cost)[: self._limit])
         least_cost = self._all[0].cost
         for hypothesis in self._all:
