@@ -38,7 +38,7 @@ class BaselineNoise:
         if not self._calibration.corrects_points:
             return event
         if event.sensor_frame not in self._calibration.sensors:
-            self._calibration.add_sensor(event.sensor_frame)
+            self._calibration.add(event.sensor_frame)
         return sensing.calibrated(self._calibration, self._settings, event)
 
     def add(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:

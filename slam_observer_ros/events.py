@@ -30,6 +30,8 @@ POINT, BEARING, RANGE, AZIMUTH, AZIMUTH_RANGE = range(5)
 """What is measured of a landmark: all; its direction; its distance; or its direction about the
 base's z, alone or with the distance. What is not measured is no part of the event."""
 
+RANGES = RANGE, AZIMUTH_RANGE  # half points with a distance, as radios measure it
+
 MAX_ID = 2**32 - 2
 """Largest landmark id: they go out as uint32, whose last one says that it is unknown."""
 

@@ -35,7 +35,7 @@ from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.lie import so3
 from slam_observer_ros.mapping.map_file import read_map
-from slam_observer_ros.models.calibration import Entry, OF_SENSOR, OF_VELOCITY
+from slam_observer_ros.models.calibration import BIAS_OF_RANGES, Entry, OF_SENSOR, OF_VELOCITY
 from slam_observer_ros.recordings.opening import files_of
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.runs.calibration import (
@@ -314,6 +314,7 @@ WELL_KNOWN = 0.1  # standard deviation over that at the start, below which nobod
 
 _WORDS = {
     'range_scale': 'range scale',
+    'range_bias': 'bias of ranges',
     'linear_scale': 'wheel scale',
     'angular_scale': 'scale of turning',
     'angular_bias': 'bias of turning',
@@ -379,7 +380,8 @@ def trades(parts: Sequence[CalibrationEstimate], correlations: FloatArray) -> li
 
 def _entry_of(name: str) -> Entry:
     name = name.partition('/')[0]
-    return next(entry for entry in (*OF_VELOCITY, *OF_SENSOR) if entry.name == name)
+    entries = (*OF_VELOCITY, *OF_SENSOR, BIAS_OF_RANGES)
+    return next(entry for entry in entries if entry.name == name)
 
 
 SEEN = 0.5  # standard deviation over that at the start up to which something was seen of a value
@@ -423,6 +425,8 @@ def state_found(
     moved: dict[str, float] = {}
     for part in found.parts:
         name, entry = part.name.partition('/')[0], _entry_of(part.name)
+        if entry is BIAS_OF_RANGES:  # no setting has one for each landmark
+            continue
         if not is_seen(part) or (name.startswith(('sensor_', 'range_')) and not is_one):
             continue
         # With two digits of the standard deviation, six decimals at most

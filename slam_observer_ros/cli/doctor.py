@@ -24,11 +24,10 @@ from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.findings import explained, Finding
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
-    AZIMUTH_RANGE,
     Event,
     ObservationEvent,
     POINT,
-    RANGE,
+    RANGES,
     UNKNOWN_ID,
     VelocityEvent,
 )
@@ -219,7 +218,7 @@ def fitting_file(kind: str, events: Sequence[Event]) -> tuple[str, str]:
     where = 'the robot stays on a floor' if flat else 'it tilts or climbs: two_d_mode: false'
     kinds = {half for e in seen for half in (e.kinds.tolist() if e.kinds is not None else [POINT])}
     if kinds and POINT not in kinds:
-        has_range = not kinds.isdisjoint((RANGE, AZIMUTH_RANGE))
+        has_range = not kinds.isdisjoint(RANGES)
         name, what = ('uwb', 'distances') if has_range else ('bearings', 'directions')
         return name, f'landmarks are seen as {what} alone, and {where}'
     if flat and _are_below(seen):

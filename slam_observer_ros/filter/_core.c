@@ -706,7 +706,7 @@ static void calibrated_point(const Seen *seen, long i, const double turned[9], i
 static void fill_sensitivity(const FilterState *x, const Seen *seen, const double R_hat[9],
                              const double J[9], const double l[3], double *D) {
     double of_all[21], column[3], turned[3];
-    sensor_matrix(J, l, of_all);
+    sensor_matrix(J, l, 7, of_all);
     memset(D, 0, (size_t)(x->k * x->c) * sizeof(double));
     for (long j = 0; j < seen->c_s; j++) {
         for (int b = 0; b < 3; b++)

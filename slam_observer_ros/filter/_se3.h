@@ -130,13 +130,13 @@ static inline Pose from_to(const Pose *A, const Pose *B) { /* A^-1 B */
 }
 
 /* D = [-hat(l) J(psi), I, l], 3 x 7: how a point at l from its sensor changes with that. */
-static inline void sensor_matrix(const double J[9], const double l[3], double D[21]) {
+static inline void sensor_matrix(const double J[9], const double l[3], int each, double *D) {
     double K[9], of_turn[9];
     hat(l, K);
     times(K, J, of_turn);
     for (int t = 0; t < 3; t++)
         for (int j = 0; j < 7; j++)
-            D[7 * t + j] = j < 3 ? -of_turn[3 * t + j] : j < 6 ? (double)(t == j - 3) : l[t];
+            D[each * t + j] = j < 3 ? -of_turn[3 * t + j] : j < 6 ? (double)(t == j - 3) : l[t];
 }
 
 static inline void seen_from(const Pose *T, const double p[3], double y[3]) { /* R' (p - x) */

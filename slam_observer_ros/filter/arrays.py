@@ -257,8 +257,8 @@ class FilterArrays(LandmarkColumns):
     ``reference_pose`` P° and ``A`` = Â (4, 4), y_i° (``y_ref``), â_i (``a``) and R_Â v_i (``u``),
     each (n, 3), metres and m/s, the ``orientations`` of tags, what was seen of each landmark
     (``landmarks``), and ``covariance``, P (N, N), empty for gains that know none.
-    ``calibration`` (43 + 7 s,) has the values of velocities and of s sensors
-    (:mod:`.sensor_models.calibration`).
+    ``calibration`` (43 + 7 s + b,) has the values of velocities, of s sensors and of b landmarks
+    (:mod:`.models.calibration`).
     ``have_moved`` says whether any landmark has had a velocity so far, ``is_exact`` that the map
     is, and no landmark is moved. ``postponed`` says what â_i have yet to follow, in large maps.
     """

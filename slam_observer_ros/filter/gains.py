@@ -339,9 +339,9 @@ class Gains(ABC):
         """Take all landmarks for exact and at rest where a map has them; never move them."""
         self.observer.fix_landmarks(known.points)
 
-    def add_sensor(self, frame: str) -> None:
-        """Let the calibration of the sensor of another frame be part of the state."""
-        self.calibration.add_sensor(frame)
+    def calibrate(self, of: str | int) -> None:
+        """Let the calibration of another frame's sensor be part of the state: see Calibration."""
+        self.calibration.add(of)
 
     # The frame
 

@@ -1,10 +1,11 @@
-"""How a sensor is really mounted, and by how much its ranges err: y = o + d + exp(ψ) e^s p.
+"""How a sensor is mounted, and how its ranges err: y = o + d + exp(ψ) e^s (1 − b/|p|) p.
 
 o is where the sensor is said to be, p from there to a point that it shows, in the body frame. ψ
-turns the sensor and d moves it, along the body's axes, and e^s is the factor of its ranges: seven
-``values`` of one sensor (7,), or of each point's (m, 7). y changes with them by
+turns the sensor and d moves it, along the body's axes, e^s is the factor of its ranges, and b by
+how much it shows those from one landmark too long: seven ``values`` of one sensor (7,), or of each
+point's with b (m, 8). y changes with them by
 
-    D = ∂y/∂(ψ, d, s) = [−[l]× J(ψ), I, l],   l = y − o − d.
+    D = ∂y/∂(ψ, d, s, b) = [−[l]× J(ψ), I, l, −e^s l/|l|],   l = y − o − d.
 
 A residual takes D at the point that is predicted. At the measured one its noise would be in D as
 well: seen too far, a point would weigh more than seen too near, and the scale run away.
@@ -46,12 +47,15 @@ class Sensed:
     sensors: IntArray  # (m,) numbers of the sensors
     origins: FloatArray  # (m, 3) o, metres
     arms: FloatArray  # (m, 3) p, metres
+    # (m,) ids of landmarks whose ranges these are and have a bias, −1 for none
+    anchors: IntArray
     orientations: FloatArray | None = None  # (m, 3, 3) of tags, zero for none
 
     def select(self, mask: BoolArray | IntArray) -> Sensed:
         """Return the points that ``mask`` (m,) picks."""
         Z = None if self.orientations is None else self.orientations[mask]
-        return Sensed(self.sensors[mask], self.origins[mask], self.arms[mask], Z)
+        sensors, anchors = self.sensors[mask], self.anchors[mask]
+        return Sensed(sensors, self.origins[mask], self.arms[mask], anchors, Z)
 
 
 def joined_sensed(parts: list[Sensed]) -> Sensed:
@@ -60,28 +64,39 @@ def joined_sensed(parts: list[Sensed]) -> Sensed:
         np.concatenate([part.sensors for part in parts]),
         np.concatenate([part.origins for part in parts]),
         np.concatenate([part.arms for part in parts]),
+        np.concatenate([part.anchors for part in parts]),
     )
 
 
 def shown_at(values: FloatArray, sensed: Sensed) -> FloatArray:
     """Return y (m, 3), metres, body frame."""
-    R, scales = so3.exp(values[..., :3]), np.exp(values[..., 6:])
+    R, scales = so3.exp(values[..., :3]), np.exp(values[..., 6:7])
+    scales = scales * without_bias(sensed.arms, values[..., 7])
     turned = (R @ sensed.arms[:, :, None])[:, :, 0]
     points: FloatArray = sensed.origins + values[..., 3:6] + scales * turned
     return points
 
 
+def without_bias(arms: FloatArray, biases: FloatArray) -> FloatArray:
+    """Return 1 − b/|p| (m, 1) of shown points p (m, 3), by biases (m,)."""
+    lengths = np.maximum(np.linalg.norm(arms, axis=1), LEAST_M)
+    shares: FloatArray = (1.0 - biases / lengths)[:, None]
+    return shares
+
+
 def sensitivity(values: FloatArray, arms: FloatArray) -> FloatArray:
-    """Return D (m, 3, 7) for points at l = ``arms`` (m, 3) from the sensor."""
-    D = np.empty((len(arms), 3, 7))
+    """Return D (m, 3, 8) for points at l = ``arms`` (m, 3) from the sensor."""
+    D = np.empty((len(arms), 3, 8))
+    lengths = np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), LEAST_M)
+    D[:, :, 7] = -np.exp(values[..., 6:7]) / lengths * arms
     D[:, :, :3] = -so3.hat(arms) @ so3.left_jacobian(values[..., :3])
     D[:, :, 3:6], D[:, :, 6] = np.eye(3), arms
     return D
 
 
 def turning(values: FloatArray) -> FloatArray:
-    """Return J(ψ) (…, 3, 7): how orientations exp(ψ) Z turn with the values (…, 7)."""
-    turns = np.zeros((*values.shape[:-1], 3, 7))
+    """Return J(ψ) (…, 3, 8): how orientations exp(ψ) Z turn with the values (…, 7)."""
+    turns = np.zeros((*values.shape[:-1], 3, 8))
     turns[..., :3] = so3.left_jacobian(values[..., :3])
     return turns
 

@@ -69,6 +69,7 @@ class Views:
     walks: FloatArray  # (n, 6, 6) covariance of the way until now, in the body's axes now
     sensors: IntArray  # (n,) which sensor each is of: each has a scale of its own
     frames: tuple[str, ...]  # of the sensors
+    bias_m: float = 0.0  # by how much all ranges from one landmark may be too long
 
     def mirrored(self) -> Views:
         """Return the views as from a way that turned to the other side."""
@@ -227,6 +228,7 @@ def _views(window: Window, state: State, known: LandmarkMap) -> Views | None:
         walks=Ad @ walks @ Ad.T,
         sensors=np.array([sensors.index(view.sensor_frame) for view in views]),
         frames=tuple(sensors),
+        bias_m=state.calibration.range_bias_m,
     )
 
 
@@ -256,7 +258,7 @@ class _Problem:
     """Residuals of views at b poses T (b, 4, 4) and ln scales s (b, n_s) at once."""
 
     def __init__(self, views: Views, axes: EstimatedAxes, scale_sigma: float) -> None:
-        self._views, self._axes = views, axes
+        self._views, self._axes, self._bias_m = views, axes, views.bias_m
         self._scale_sigma = max(scale_sigma, 1e-6)
         self._is_range = np.isfinite(views.ranges)
         self._ranges = np.where(self._is_range, views.ranges, 0.0)
@@ -320,7 +322,7 @@ class _Problem:
         """Return how uncertain residuals (b, n, 4) are, each by itself: variances."""
         of_ranges, of_directions = self._views.variances.T
         variances = np.empty((*lengths.shape, 4))
-        variances[..., 0] = of_ranges + self._way_m2
+        variances[..., 0] = of_ranges + self._way_m2 + self._bias_m**2
         angular = of_directions + self._way_rad2 + self._way_m2 / lengths**2
         variances[..., 1:] = angular[..., None]
         return variances
@@ -399,7 +401,7 @@ class _Problem:
         view = rows // 4
         later = np.maximum(view[:, None], view[None, :]) == view[None, :]
         same = views.named[view][:, None] == views.named[view][None, :]
-        weights = np.ones(len(rows))
+        weights, biases = np.ones(len(rows)), self._bias_m * (rows % 4 == 0)
         cost, square, covariance = np.inf, np.inf, np.eye(len(columns))
         for _ in range(FITTING_STEPS):
             e, lines, lengths = self.parts(T, s)
@@ -411,9 +413,10 @@ class _Problem:
             WG = np.einsum('qij,qj->qi', views.walks[view], g)
             ways = g @ WG.T
             ways = np.where(later, ways, ways.T)
-            # … and where the landmark is, if it is the same.
+            # … and where the landmark is, and how much too long its ranges, if it is the same.
             in_body = R.T @ views.landmark_covariances[view] @ R
-            of_points = np.where(same, np.einsum('qi,qij,rj->qr', D, in_body, D), 0.0)
+            of_landmarks = np.einsum('qi,qij,rj->qr', D, in_body, D) + np.outer(biases, biases)
+            of_points = np.where(same, of_landmarks, 0.0)
             own = np.broadcast_to(views.variances[:, [0, 1, 1, 1]], (len(lengths[0]), 4))
             S = ways + of_points + np.diag(own.ravel()[rows])
             r = e[0].ravel()[rows]

@@ -4,7 +4,7 @@ V_true(t) = M V(t − τ) + b, where M has the scale factors 1 + s on its diagon
 in observations later than its stamp, by the delay τ: a command takes a while to be obeyed, and an
 image a while to be stamped. A sensor's part, ψ, d and s of
 :mod:`slam_observer_ros.lie.sensor_mounting`, begins with the first observation from its
-frame.
+frame, and b, by which ranges from one landmark are too long, with the first of these.
 """
 
 from __future__ import annotations
@@ -21,13 +21,16 @@ from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_ns
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.lie.axes import EstimatedAxes
+from slam_observer_ros.lie.sensor_mounting import Sensed
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 MOVES = 6  # column of b in [M b] (6, 7), which is multiplied by 1 where a velocity is not zero
-DELAY, SENSORS, EACH = 42, 43, 7  # where τ is behind [M b], and, behind it, values of each sensor
+# Where τ is behind [M b], row by row, and behind it ``EACH`` values of each sensor, and one value
+# of each landmark whose ranges have a bias.
+DELAY, SENSORS, EACH = 42, 43, 7
 
 # Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier. How
 # the robot moves so much later is not known yet when it is needed: without a limit the estimate,
@@ -72,15 +75,18 @@ OF_SENSOR = (
     *_entries('range_scale', [SCALE := 6]),
 )
 
+# What may be of each landmark: by how much all ranges from it are too long.
+(BIAS_OF_RANGES,) = _entries('range_bias', [0])
+
 # Parameters that say how far these may be off, 0 for not at all.
 VELOCITY_STDDEVS, SENSOR_STDDEVS = (
     tuple(dict.fromkeys(f'{entry.parameter}_stddev' for entry in entries))
-    for entries in (OF_VELOCITY, OF_SENSOR)
+    for entries in (OF_VELOCITY, (*OF_SENSOR, BIAS_OF_RANGES))
 )
 
 
 class CalibrationOwner(Protocol):
-    """What has the values (43 + 7 s,) of velocities, [M b] and τ, and of s sensors."""
+    """What has the values (43 + 7 s + b,) of velocities, of s sensors and of b landmarks."""
 
     calibration: FloatArray
 
@@ -92,7 +98,8 @@ class Calibration:
     ``drift_covariance`` (c, c) a second, if one ``drifts``; ``delay_error_ns`` is the standard
     deviation of τ at the start, 0 where it is not estimated. ``sensors`` are the frames of those
     seen so far, and ``of_sensor`` (c_s,) says which of the seven values of each are estimated;
-    ``corrects_points`` says whether what they show is not taken as it comes.
+    ``corrects_points`` says whether what they show is not taken as it comes, and
+    ``range_bias_m`` how far ranges from one landmark may be off.
     """
 
     def __init__(self, owner: CalibrationOwner, settings: Settings, axes: EstimatedAxes) -> None:
@@ -109,12 +116,21 @@ class Calibration:
         of_sensor = np.append(np.arange(6)[axes.pose], SCALE)
         self.of_sensor: IntArray = of_sensor[deviations[of_sensor] > 0.0]
         self._stated, self._sensor_variances = stated, deviations[self.of_sensor] ** 2
+        self._bias_variance = np.array([settings.range_bias_stddev**2])
         self.sensors: tuple[str, ...] = ()
-        self.corrects_points = bool(settings.range_is_depth or stated.any() or len(self.of_sensor))
+        self.range_bias_m = settings.range_bias_stddev
+        # Of frames and ids of landmarks: where their values begin, and their entries of the c.
+        self._begins: dict[str | int, tuple[int, int]] = {}
+        self.corrects_points = bool(
+            settings.range_is_depth or stated.any() or len(self.of_sensor) or self.range_bias_m
+        )
         self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
         self.of_velocity = len(self.velocity_places)  # how many of the c are no sensor's
         # (c,) which of the values these are, and all as they were at the start
         self._places, self._nominal = self.velocity_places, stated_of_velocity(settings)
+        self._names = tuple(
+            (entry.name, entry.unit) for entry in OF_VELOCITY if errors[entry.place] > 0.0
+        )
         owner.calibration = self._nominal.copy()
         self._set_variances(errors[self._places] ** 2)
 
@@ -129,16 +145,26 @@ class Calibration:
         self.drift_covariance = np.diag(variances * self._settings.calibration_drift**2)
         self.drifts = bool(self.drift_covariance.any())
 
-    def add_sensor(self, frame: str) -> FloatArray:
-        """Append the estimated entries of a new frame's sensor; return their variances (c_s,)."""
-        more, owner = len(self._nominal) + self.of_sensor, self._owner
-        self.sensors = (*self.sensors, frame)
-        self._places = np.append(self._places, more)
-        self._nominal = np.append(self._nominal, self._stated)
-        owner.calibration = np.append(owner.calibration, self._stated)
-        self._set_variances(np.append(self.initial_variances, self._sensor_variances))
-        variances: FloatArray = self._sensor_variances
-        return variances
+    def add(self, of: str | int) -> FloatArray:
+        """Append the estimated entries of a new frame's sensor; return their variances (c_s,).
+
+        Or the bias of ranges from a landmark, by its id.
+        """
+        if isinstance(of, str):
+            stated, estimated, variances = self._stated, self.of_sensor, self._sensor_variances
+            entries = [(OF_SENSOR[each].name, OF_SENSOR[each].unit) for each in estimated]
+            self.sensors = (*self.sensors, of)
+        else:
+            stated, estimated, variances = np.zeros(1), np.zeros(1, int), self._bias_variance
+            entries = [(BIAS_OF_RANGES.name, BIAS_OF_RANGES.unit)]
+        owner, first = self._owner, len(self._nominal)
+        self._begins = {**self._begins, of: (first, self.count)}
+        self._names += tuple((f'{name}/{of}' if of != '' else name, u) for name, u in entries)
+        self._places = np.append(self._places, first + estimated)
+        self._nominal = np.append(self._nominal, stated)
+        owner.calibration = np.append(owner.calibration, stated)
+        self._set_variances(np.append(self.initial_variances, variances))
+        return np.asarray(variances)
 
     @property
     def values(self) -> FloatArray:
@@ -164,23 +190,47 @@ class Calibration:
 
     def sensor(self, frame: str) -> FloatArray:
         """Return ψ, d and s (7,) of a sensor, as a view."""
-        first = SENSORS + EACH * self.sensors.index(frame)
+        first, _ = self._begins[frame]
         values: FloatArray = self._owner.calibration[first : first + EACH]
         return values
 
     def columns(self, frame: str) -> slice:
         """Return which of the c entries belong to a sensor."""
-        each = len(self.of_sensor)
-        first = self.of_velocity + each * self.sensors.index(frame)
-        return slice(first, first + each)
+        _, first = self._begins[frame]
+        return slice(first, first + len(self.of_sensor))
 
-    def sensor_columns(self) -> tuple[FloatArray, IntArray]:
-        """Return ψ, d and s of all sensors (s, 7), and which of the c entries they are, or −1."""
-        values = self._owner.calibration[SENSORS:].reshape(-1, EACH)
-        columns = np.full(values.shape, -1)
-        estimated = np.arange(self.of_velocity, self.count)
-        columns[:, self.of_sensor] = estimated.reshape(len(values), -1)
-        return values.copy(), columns
+    def without_bias(self, ids: IntArray) -> IntArray:
+        """Return the landmarks among ``ids`` (m,) whose ranges have no bias yet, each once."""
+        known = [-1, *self._begins]
+        return np.unique([each for each in ids.tolist() if each not in known]).astype(np.int64)
+
+    def biases(self, ids: IntArray) -> tuple[FloatArray, IntArray]:
+        """Return by how much ranges from landmarks (m,) are too long, metres, 0 where none is.
+
+        And which of the c entries that is, −1 for none.
+        """
+        begins = [self._begins.get(each, (-1, -1)) for each in ids.tolist()]
+        places, columns = np.array(begins, dtype=np.int64).reshape(-1, 2).T
+        biases = np.where(places < 0, 0.0, self._owner.calibration[places])
+        return biases, columns
+
+    def sensor_columns(self, sensed: Sensed) -> tuple[Sensed, FloatArray, IntArray]:
+        """Return ψ, d, s and b (s, 8) of all sensors, and which of the c entries they are, or −1.
+
+        Each landmark whose ranges have a bias makes another sensor of the one that showed it.
+        """
+        count = len(self.sensors)
+        pairs, numbers = np.unique(
+            sensed.sensors + count * (sensed.anchors + 1), return_inverse=True
+        )
+        anchors, sensors = np.divmod(pairs, count)
+        values, columns = np.zeros((len(pairs), EACH + 1)), np.full((len(pairs), EACH + 1), -1)
+        values[:, EACH], columns[:, EACH] = self.biases(anchors - 1)
+        for row, sensor in enumerate(sensors.tolist()):
+            frame = self.sensors[sensor]
+            values[row, :EACH], of = self.sensor(frame), self.columns(frame)
+            columns[row, self.of_sensor] = np.arange(of.start, of.stop)
+        return replace(sensed, sensors=numbers), values, columns
 
     def estimates(
         self, variances: FloatArray, values: FloatArray | None = None
@@ -191,32 +241,25 @@ class Calibration:
         """
         values = self.values if values is None else values
         stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
-        each = zip(self._places.tolist(), values, variances, stated, strict=True)
-        return [self._estimate(*part) for part in each]
-
-    def _estimate(
-        self, place: int, value: float, variance: float, stated: float
-    ) -> CalibrationEstimate:
-        nominal, factor = self._nominal[place], 1.0
-        if place < SENSORS:
-            name, unit = next(
-                (entry.name, entry.unit) for entry in OF_VELOCITY if entry.place == place
-            )
-        else:
-            sensor, number = divmod(place - SENSORS, EACH)
-            entry, frame = OF_SENSOR[number], self.sensors[sensor]
-            name, unit = entry.name + f'/{frame}' * bool(frame), entry.unit
-            if number == SCALE:  # s is its logarithm
+        estimates = []
+        for place, (name, unit), value, variance, known in zip(
+            self._places.tolist(), self._names, values, variances, stated, strict=True
+        ):
+            nominal, factor = self._nominal[place], 1.0
+            if name.partition('/')[0] == 'range_scale':  # s is its logarithm
                 value, nominal = math.exp(value), math.exp(nominal)
                 factor = value
-        return CalibrationEstimate(
-            name,
-            float(value),
-            float(factor * np.sqrt(variance)),
-            unit,
-            nominal=float(nominal),
-            stated=float(factor * stated),
-        )
+            estimates.append(
+                CalibrationEstimate(
+                    name,
+                    float(value),
+                    float(factor * np.sqrt(variance)),
+                    unit,
+                    nominal=float(nominal),
+                    stated=float(factor * known),
+                )
+            )
+        return estimates
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (…, 6) as M V + b; exact zeros stay so."""

@@ -18,8 +18,8 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import RangePower, Update
 from slam_observer_ros.events import flatten, ObservationEvent, POINT
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.lie.sensor_mounting import Sensed, sensitivity, turning
-from slam_observer_ros.models.calibration import Calibration
+from slam_observer_ros.lie.sensor_mounting import Sensed, sensitivity, turning, without_bias
+from slam_observer_ros.models.calibration import Calibration, EACH
 from slam_observer_ros.settings.estimator_settings import Settings
 
 LEAST_COSINE = 0.2  # cosine of the angle off its axis, 78°, beyond which no sensor sees depth
@@ -29,9 +29,14 @@ _TINY = np.finfo(np.float64).tiny
 
 
 def calibrated(
-    calibration: Calibration, settings: Settings, event: ObservationEvent
+    calibration: Calibration,
+    settings: Settings,
+    event: ObservationEvent,
+    anchors: IntArray | None = None,
 ) -> ObservationEvent:
     """Return an observation as it is by the calibration of its sensor; keep what that showed.
+
+    ``anchors`` (m,) are the landmarks of ranges that have a bias, −1 for other points.
 
     Points of a depth that is taken for a range are as much further off as 1/cos b makes them, at
     the angle b off the sensor's axis.
@@ -42,7 +47,9 @@ def calibrated(
     arms = event.points - origins
     if settings.range_is_depth:
         arms = arms / cosines(arms, event.sensor_axis)[:, None]
-    sensed = Sensed(np.full(len(arms), number), origins, arms, event.orientations)
+    if anchors is None:
+        anchors = np.full(len(arms), -1)
+    sensed = Sensed(np.full(len(arms), number), origins, arms, anchors, event.orientations)
     covariances, velocities, R = event.covariances, event.velocities, so3.exp(values[:3])
     directions = event.directions
     if covariances is not None:
@@ -71,8 +78,10 @@ def calibrated_again(calibration: Calibration, event: ObservationEvent) -> Obser
         return event
     values = calibration.sensor(event.sensor_frame)
     R, scale = so3.exp(values[:3]), math.exp(values[6])
-    sensor = sensed.origins + values[3:6]
-    points = sensed.arms.dot(scale * R.T) + sensor
+    sensor, arms = sensed.origins + values[3:6], sensed.arms
+    if calibration.range_bias_m:
+        arms = without_bias(arms, calibration.biases(sensed.anchors)[0]) * arms
+    points = arms.dot(scale * R.T) + sensor
     if calibration.axes.point == 2:  # the line of sight keeps its height
         sensor[:, 2] -= points[:, 2]
         points[:, 2] = 0.0
@@ -90,6 +99,10 @@ def point_sensitivity(
     frame, D = event.sensor_frame, np.zeros((len(points), 3, calibration.count))
     of_sensor = sensitivity(calibration.sensor(frame), points - event.sensor)
     D[:, :, calibration.columns(frame)] = of_sensor[:, :, calibration.of_sensor]
+    if calibration.range_bias_m:
+        _, columns = calibration.biases(event.sensed.anchors)
+        at = np.flatnonzero(columns >= 0)
+        D[at, :, columns[at]] = of_sensor[at, :, EACH]
     return D
 
 

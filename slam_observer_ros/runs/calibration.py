@@ -225,15 +225,16 @@ class Found:
         return {
             part.name.partition('/')[2]
             for part in self.parts
-            if part.name.startswith(('sensor_', 'range_'))
+            if part.name.startswith(('sensor_', 'range_scale'))
         }
 
 
 ROTATION, TRANSLATION = (0.1,) * 3, (0.1,) * 3
 """How a sensor may be mounted: some 6° and 10 cm off what is stated."""
 
-SCALE, BIAS, DELAY_S = 0.1, 0.02, 0.3
-"""How far scales, of ranges and velocities, a gyroscope's zero (rad/s) and a clock may be off."""
+SCALE, RANGE_BIAS_M, BIAS, DELAY_S = 0.1, 0.2, 0.02, 0.3
+"""How far scales, of ranges and velocities, all ranges from one landmark, a gyroscope's zero
+(rad/s) and a clock may be off."""
 
 NOISY = 0.05
 """Share of noise in the velocities, squared, beyond which a known map shows no scale of theirs."""
@@ -290,6 +291,7 @@ def opened(
         'sensor_rotation_stddev': ROTATION,
         'sensor_translation_stddev': TRANSLATION,
         'range_scale_stddev': SCALE,
+        'range_bias_stddev': RANGE_BIAS_M if is_surveyed else 0.0,
         'angular_bias_stddev': (BIAS,) * 3,
         'velocity_delay_stddev': DELAY_S,
     }

@@ -159,6 +159,10 @@ class Settings:
         0.0, 'Riccati: standard deviation of range_scale, which is estimated; without a surveyed '
         "map it can hardly be distinguished from the velocity's scale",
         minimum=0.0, maximum=1.0)
+    range_bias_stddev: float = parameter(
+        0.0, 'Riccati: how much too long all ranges from one landmark may be, which is estimated '
+        'for each of them, of ranges without a direction in space: delays of UWB antennas are off '
+        'by some 0.1', unit='m', minimum=0.0, maximum=10.0)
     range_is_depth: bool = parameter(
         False, "Whether the sensor's range is depth along its axis, as of cameras that judge "
         'distance by apparent size; the axis is x of its frame, z of an optical one')

@@ -59,7 +59,10 @@ typedef struct {
 static const char *const LINKS[] = {"dA44", "dAdc", "dAdd", "dAc", NULL};
 
 /* Points where they were seen; or, of calibrated sensors, which these are, what they showed, and
- * of each its values (psi, d, s) and where in the calibration these are; -1 for none. */
+ * of each its values (psi, d, s, b) and where in the calibration these are; -1 for none. */
+enum { VALUES = 8 };  /* of a sensor */
+#define LEAST_M 0.05 /* sensor_mounting.py */
+
 typedef struct {
     const double *points, *information, *shares;
     const i64 *sensors;
@@ -91,12 +94,12 @@ static int read_prior(Door *door, PyObject *tuple, const Equations *eq, Prior *p
 
 static int read_seen(Door *door, PyObject *tuple, const Equations *eq, Seen *seen) {
     static const char *const specs[] = {"dM3", "dMkk", "dM",  "~xM",
-                                        "~dM3", "~dM3", "dv7", "xv7", NULL};
+                                        "~dM3", "~dM3", "dv8", "xv8", NULL};
     if (!read_fields(door, tuple, specs, seen, "Seen"))
         return 0;
     Py_ssize_t count = door->sizes['v'];
     seen->first = eq->c;
-    for (Py_ssize_t j = 0; j < 7 * count; j++) {
+    for (Py_ssize_t j = 0; j < VALUES * count; j++) {
         if (seen->columns[j] < -1 || seen->columns[j] >= eq->c)
             return refuse("Seen");
         if (seen->columns[j] >= 0 && seen->columns[j] < seen->first)
@@ -329,25 +332,30 @@ static double weight_of(const double *e, const double *information, long k,
     return huber > 0.0 ? weight * huber / sqrt(larger(squared, huber * huber)) : weight;
 }
 
-/* What a calibrated sensor shows, y = o + d + e^s exp(psi) p, and D = [-hat(l) J(psi), I, l], how
- * that changes with its values at l from it (sensor_mounting.py). */
-static void sense(const Seen *seen, long m, const double predicted[3], double y[3], double D[21]) {
-    const double *values = seen->values + 7 * seen->sensors[m], *origin = seen->origins + 3 * m;
+/* What a calibrated sensor shows, y = o + d + e^s (1 - b/|p|) exp(psi) p, and how that changes with
+ * its values at l from it, D = [-hat(l) J(psi), I, l, -e^s l/|l|] (sensor_mounting.py). */
+static void sense(const Seen *seen, long m, const double predicted[3], double y[3],
+                  double D[3 * VALUES]) {
+    const double *values = seen->values + VALUES * seen->sensors[m];
+    const double *origin = seen->origins + 3 * m, *arm = seen->arms + 3 * m;
     double R[9], J[9], turned[3], l[3];
     exp_and_jacobian(values, R, J);
-    turn(R, seen->arms + 3 * m, turned);
+    turn(R, arm, turned);
+    double scale = exp(values[6]) * (1.0 - values[7] / larger(sqrt(dot3(arm, arm)), LEAST_M));
     for (int t = 0; t < 3; t++) {
-        y[t] = origin[t] + values[3 + t] + exp(values[6]) * turned[t];
+        y[t] = origin[t] + values[3 + t] + scale * turned[t];
         l[t] = predicted[t] - origin[t] - values[3 + t];
     }
-    sensor_matrix(J, l, D);
+    sensor_matrix(J, l, VALUES, D);
+    for (int t = 0; t < 3; t++)
+        D[VALUES * t + 7] = -exp(values[6]) / larger(sqrt(dot3(l, l)), LEAST_M) * l[t];
 }
 
 /* e = R' (p - x) - y, J (k x q) = [-C, R', -D] by pose, landmark and sensors */
 static void point_error(const Equations *eq, const Seen *seen, const Solution *at, long m,
                         double e[3], double *J) {
     long d = eq->d, k = eq->k, q = d + k + seen->c_s;
-    double predicted[3], y[3], C[18], D[21];
+    double predicted[3], y[3], C[18], D[3 * VALUES];
     Pose pose = pose_of(at->poses + 16 * eq->poses[m]);
     seen_from(&pose, at->points + 3 * eq->landmarks[m], predicted);
     output_matrix(predicted, d, C, d);
@@ -361,10 +369,10 @@ static void point_error(const Equations *eq, const Seen *seen, const Solution *a
             J[t * q + j] = -C[t * d + j];
         for (long j = 0; j < k; j++)
             J[t * q + d + j] = pose.R[3 * j + t];
-        for (long j = 0; j < 7 && seen->sensors != NULL; j++) {
-            long column = (long)seen->columns[7 * seen->sensors[m] + j];
+        for (long j = 0; j < VALUES && seen->sensors != NULL; j++) {
+            long column = (long)seen->columns[VALUES * seen->sensors[m] + j];
             if (column >= 0)
-                J[t * q + d + k + column - seen->first] = -D[7 * t + j];
+                J[t * q + d + k + column - seen->first] = -D[VALUES * t + j];
         }
     }
 }

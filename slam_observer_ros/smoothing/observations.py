@@ -29,6 +29,7 @@ from slam_observer_ros.lie.sensor_mounting import (
     shown_at,
     turning,
     UNMEASURED_M,
+    without_bias,
 )
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
@@ -37,13 +38,13 @@ from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 FlatSensed: TypeAlias = tuple[IntArray, FloatArray, FloatArray, FloatArray, IntArray]
 
 # The same where none is calibrated.
-NO_SENSORS = None, None, None, np.empty((0, 7)), np.empty((0, 7), dtype=np.int64)
+NO_SENSORS = None, None, None, np.empty((0, 8)), np.empty((0, 8), dtype=np.int64)
 
 
 class SensedPoints:
     """M points; the last ``count`` entries c_s of the calibration belong to their sensors.
 
-    ``stated`` (s, 7) has the values of s sensors, and ``columns`` (s, 7) where in the calibration
+    ``stated`` (s, 8) has the values of s sensors, and ``columns`` (s, 8) where in the calibration
     (c,) those are that are estimated, −1 for others.
     """
 
@@ -65,7 +66,7 @@ class SensedPoints:
         return self._estimated(sensitivity(values, arms))
 
     def flat(self, calibration: FloatArray) -> FlatSensed:
-        """Return sensors (M,), their origins and arms (M, 3), values and columns (s, 7)."""
+        """Return sensors (M,), their origins and arms (M, 3), values and columns (s, 8)."""
         sensed, (stated, columns) = self._sensed, self._of_sensors
         estimated = np.append(calibration, 0.0)[columns]
         values = np.where(columns >= 0, estimated, stated)
@@ -84,10 +85,11 @@ class SensedPoints:
         And their lines of sight (h, 3) as shown and as expected, body frame.
         """
         values, sensed = self._values(calibrations)[half], self._sensed
-        R, scales = so3.exp(values[:, :3]), np.exp(values[:, 6:])
+        R, scales = so3.exp(values[:, :3]), np.exp(values[:, 6:7])
         lines = predicted - sensed.origins[half] - values[:, 3:6]
         lines[:, k:] = 0.0
         expected = (transpose(R) @ lines[:, :, None])[:, :, 0] / scales
+        expected = without_bias(expected, -values[:, 7]) * expected
         arms = sensed.arms.copy()
         arms[half] = completed_lines(arms[half], expected, kinds)
         before = scales * (R @ sensed.arms[half, :, None])[:, :, 0]
@@ -104,14 +106,14 @@ class SensedPoints:
         return self._estimated(turning(self._values(calibrations)))
 
     def _values(self, calibrations: FloatArray) -> FloatArray:
-        """Return ψ, d and s (M, 7) of each point's sensor."""
+        """Return ψ, d, s and b (M, 8) of each point's sensor."""
         if not self.count:
             return self._stated
         estimated = np.take_along_axis(calibrations, np.maximum(self._columns, 0), axis=1)
         return np.where(self._are_estimated, estimated, self._stated)
 
     def _estimated(self, D: FloatArray) -> FloatArray:
-        """Return the columns (M, 3, c_s) of D (M, 3, 7) that are estimated, of its own sensor."""
+        """Return the columns (M, 3, c_s) of D (M, 3, 8) that are estimated, of its own sensor."""
         estimated = np.zeros((len(D), 3, self.count))
         rows, parts = np.nonzero(self._are_estimated)
         estimated[rows, :, self._columns[rows, parts] - self._first] = D[rows, :, parts]

@@ -498,8 +498,8 @@ class Relinearisation(Past):
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
         calibration, sensed = self._calibration, None
         if keyframes.sensed is not None:
-            stated, columns = calibration.sensor_columns()
-            sensed = SensedPoints(keyframes.sensed, stated, columns, calibration.count)
+            parts = calibration.sensor_columns(keyframes.sensed)
+            sensed = SensedPoints(*parts, calibration.count)
         return Smoother(self._axes, prior, keyframes, self._settings, sensed)
 
     def _without_outliers_of_then(self, smoother: Smoother, start: Solution) -> Solution:

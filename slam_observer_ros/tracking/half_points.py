@@ -23,7 +23,7 @@ from slam_observer_ros.events import (
     BEARING,
     ObservationEvent,
     POINT,
-    RANGE,
+    RANGES,
 )
 from slam_observer_ros.filter.robust import straight_odds, straight_share
 from slam_observer_ros.lie.matrices import diagonal_blocks, transpose
@@ -34,6 +34,7 @@ from slam_observer_ros.lie.sensor_mounting import (
     MEASURED,
     measured_axes,
     unmeasured_covariances,
+    without_bias,
 )
 from slam_observer_ros.models.calibration import SCALE
 from slam_observer_ros.models.observation_noise import ObservationNoise
@@ -96,7 +97,7 @@ class HalfPoints:
         sensor_z = event.points[:, 2] - lines[:, 2]
         known = [self.heights_m.get(landmark_id, math.nan) for landmark_id in event.ids.tolist()]
         rise_m, range_m = np.array(known) - sensor_z, np.linalg.norm(lines, axis=1)
-        has_slant = np.isin(event.kinds, (RANGE, AZIMUTH_RANGE)) & (range_m > 0.0)
+        has_slant = np.isin(np.asarray(event.kinds), RANGES) & (range_m > 0.0)
         slant = np.flatnonzero(has_slant & np.isfinite(rise_m))
         if not len(slant):
             return event
@@ -126,8 +127,8 @@ class HalfPoints:
         """
         if event.kinds is None or not (event.kinds != POINT).any():
             return event
-        event = _with_sensor(state, event)
         rows = state.landmarks.rows_of(event.ids)
+        anchors = _with_calibration(state, event, rows)
         lines, covariances, directions = _completed(state, event, rows)
         entered = np.zeros(len(rows), dtype=np.bool_)
         is_sought = is_lost & np.isin(event.ids, self.mapped_ids)
@@ -148,18 +149,25 @@ class HalfPoints:
                     entered[row] = True
         usable = (rows >= 0) | (event.kinds == POINT) | entered
         self._counts.note(Reason.WAITING, event.ids[~usable], event.stamp_ns)
-        kinds = np.asarray(event.kinds)
-        kinds = np.where(entered, POINT, kinds)
+        kinds = np.where(entered, POINT, np.asarray(event.kinds))
+        anchors = np.where(usable, anchors, -1)
         points = event.points - event.lines_of_sight + lines
         whole = replace(
             event, points=points, covariances=covariances, kinds=kinds, directions=directions
         )
         whole = _curved(state, whole, rows)
-        covariances = self._without_detours(state, whole, rows, event)
-        return replace(whole, covariances=covariances).select(usable)
+        covariances = self._without_detours(state, whole, rows, event, anchors)
+        whole = replace(whole, covariances=covariances).select(usable)
+        # Else the step calibrates it, which knows no landmarks.
+        return calibrated(state, whole, anchors[usable]) if (anchors >= 0).any() else whole
 
     def _without_detours(
-        self, state: State, event: ObservationEvent, rows: IntArray, of_shown: ObservationEvent
+        self,
+        state: State,
+        event: ObservationEvent,
+        rows: IntArray,
+        of_shown: ObservationEvent,
+        anchors: IntArray,
     ) -> FloatArray:
         """Return the covariances (m, 3, 3) of a completed event, larger of ranges too long.
 
@@ -171,7 +179,8 @@ class HalfPoints:
         measures = MEASURED[of_axes(of_shown.kinds, state)][:, 0]
         # Landmarks that ranges have put where they are have the detours of these in them.
         is_range = is_half & measures & (rows >= 0) & np.isin(event.ids, self.mapped_ids)
-        S = _expected_covariances(state, event.select(is_range), rows[is_range])
+        by_calibration = calibrated(state, event.select(is_range), anchors[is_range])
+        S = _expected_covariances(state, by_calibration, rows[is_range])
         if S is None:
             return covariances
         shown, lines = of_shown.lines_of_sight[is_range], event.lines_of_sight[is_range]
@@ -181,7 +190,14 @@ class HalfPoints:
         along = lines / np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-9)
         own = np.einsum('mi,mij,mj->m', along, covariances[is_range], along)
         sigmas_m = np.sqrt(np.einsum('mi,mij,mj->m', along, S, along))
-        self.offsets.note(event.ids[is_range], off_m, sigmas_m, np.sqrt(own), state)
+        self.offsets.note(
+            event.ids[is_range],
+            off_m,
+            state.calibration.biases(anchors[is_range])[0],
+            sigmas_m,
+            np.sqrt(own),
+            state,
+        )
         noise_m = self.offsets.noisier * sigmas_m
         share = straight_share(off_m / noise_m, straight_odds(noise_m, ranges_m))
         share[off_m > state.settings.rejection_threshold * sigmas_m] = 1.0
@@ -203,17 +219,18 @@ class RangeOffsets:
         self,
         ids: IntArray,
         off_m: FloatArray,
+        biases_m: FloatArray,
         sigmas_m: FloatArray,
         own_m: FloatArray,
         state: State,
     ) -> None:
-        """Note differences (m,), their standard deviations, and the sensor's part of these."""
+        """Note differences (m,) beside estimated biases, their deviations, the sensor's part."""
         at = state.observer.A[:3, 3]
         if np.linalg.norm(at - self._last_at) < LEAST_MOVE_M:
             return  # from one place all have the same error
         self._last_at = at.copy()
         for landmark_id, *difference in zip(
-            ids.tolist(), off_m.tolist(), own_m.tolist(), strict=True
+            ids.tolist(), (off_m + biases_m).tolist(), own_m.tolist(), strict=True
         ):
             kept = self._of.setdefault(landmark_id, deque(maxlen=KEPT))
             kept.append((difference[0], difference[1]))
@@ -257,7 +274,7 @@ def _expected_covariances(
     """Return how far off points of landmarks may be seen (m, 3, 3), body axes, m²; or None."""
     if not len(rows):
         return None
-    event, k = calibrated(state, event), state.axes.point
+    k = state.axes.point
     residuals = residuals_of(state, event, rows, np.asarray(event.covariances))
     S = state.gains.innovation_covariance(residuals)
     if not len(S):
@@ -335,12 +352,19 @@ def with_kinds(update: Update, event: ObservationEvent) -> Update:
     return replace(update, kinds=kinds)
 
 
-def _with_sensor(state: State, event: ObservationEvent) -> ObservationEvent:
-    """Let a sensor whose calibration is estimated be known before it is asked for."""
-    calibration = state.calibration
+def _with_calibration(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
+    """Let what is estimated of a calibration be known before it is asked for.
+
+    Return the landmarks (m,) whose ranges have a bias, −1 for other points.
+    """
+    calibration, anchors = state.calibration, np.full(len(rows), -1)
     if calibration.corrects_points and event.sensor_frame not in calibration.sensors:
-        state.add_sensor(event.sensor_frame)
-    return event
+        state.calibrate(event.sensor_frame)
+    if calibration.range_bias_m:
+        is_range = np.isin(np.asarray(event.kinds), RANGES)
+        anchors[is_range] = event.ids[is_range]
+        state.calibrate_ranges(anchors[rows >= 0])
+    return anchors
 
 
 def take_scales(
@@ -355,7 +379,7 @@ def take_scales(
     if SCALE not in calibration.of_sensor:
         return
     for frame, scale in scales.items():
-        state.gains.add_sensor(frame)
+        state.gains.calibrate(frame)
         change = np.zeros(calibration.count)
         now = math.log(sensor_values(lost, frame)[2]) + scale
         change[calibration.columns(frame)] = np.where(
@@ -409,6 +433,10 @@ def expected_lines(state: State, event: ObservationEvent, rows: IntArray) -> Flo
     if state.axes.point == 2:
         lines[:, 2] = 0.0
     shown: FloatArray = lines @ R / scale
+    if state.calibration.range_bias_m:
+        is_range = np.isin(np.asarray(event.kinds), RANGES)
+        biases, _ = state.calibration.biases(np.where(is_range, event.ids, -1))
+        shown = without_bias(shown, -biases) * shown
     return shown
 
 

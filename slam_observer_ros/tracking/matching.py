@@ -54,14 +54,19 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
     return MatchedObservation(event, rows, covariances, known, residuals, left_out)
 
 
-def calibrated(state: State, event: ObservationEvent) -> ObservationEvent:
-    """Return an observation by the calibration of its sensor, if it is not so yet."""
+def calibrated(
+    state: State, event: ObservationEvent, anchors: IntArray | None = None
+) -> ObservationEvent:
+    """Return an observation by the calibration of its sensor, if it is not so yet.
+
+    ``anchors`` (m,) are the landmarks whose ranges have a bias, −1 for other points.
+    """
     calibration = state.calibration
     if not calibration.corrects_points or event.sensed is not None:
         return event
     if event.sensor_frame not in calibration.sensors:
-        state.add_sensor(event.sensor_frame)
-    return sensing.calibrated(calibration, state.settings, event)
+        state.calibrate(event.sensor_frame)
+    return sensing.calibrated(calibration, state.settings, event, anchors)
 
 
 def calibrated_again(state: State, event: ObservationEvent) -> ObservationEvent:

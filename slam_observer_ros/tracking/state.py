@@ -177,10 +177,16 @@ class State:
         """Relinearise nothing of what was seen until now; ``since`` says what has happened."""
         self.relinearisation.reset(since)
 
-    def add_sensor(self, frame: str) -> None:
-        """Begin to calibrate the sensor of another frame."""
-        self.gains.add_sensor(frame)
+    def calibrate(self, of: str | int) -> None:
+        """Begin to calibrate another frame's sensor, or ranges from a landmark, by its id."""
+        self.gains.calibrate(of)
         self.relinearisation.add_calibration()
+
+    def calibrate_ranges(self, ids: IntArray) -> None:
+        """Begin to calibrate ranges from landmarks (m,), where that is new; −1 is none."""
+        if self.calibration.range_bias_m:
+            for landmark_id in self.calibration.without_bias(ids).tolist():
+                self.calibrate(landmark_id)
 
     def relocate(
         self, rows: IntArray, points: FloatArray, covariances: FloatArray, D: FloatArray | None

@@ -71,7 +71,9 @@ def observe(one: Association) -> bool:
     state, event, rows = one.state, one.event, one.rows
     settings, noise, gains = state.settings, state.observation_noise, state.gains
     if state.calibration.corrects_points and event.sensor_frame not in state.calibration.sensors:
-        state.add_sensor(event.sensor_frame)
+        state.calibrate(event.sensor_frame)
+    if event.sensed is not None:
+        state.calibrate_ranges(event.sensed.anchors)
     one.known = known = rows >= 0
     # History depends on landmarks that will have to make room.
     if not known.all() and len(_rows_to_forget(state, event, rows)):
@@ -290,7 +292,8 @@ def keyframe(one: Association, turns: SeenOrientations | None) -> Keyframe:
     if seen.sensor is not None:
         number = one.state.calibration.sensors.index(event.sensor_frame)
         origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
-        sensed = Sensed(np.full(len(rows), number), origins, seen.arms, event.orientations)
+        numbers, none = np.full(len(rows), number), np.full(len(rows), -1)
+        sensed = Sensed(numbers, origins, seen.arms, none, event.orientations)
     covariances = out.covariances if len(out.covariances) else None
     if covariances is not None and seen.directions is not None:
         covariances = covariances + unmeasured_covariances(seen.directions)

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slam_observer_ros.common.stamps import to_s
-from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import AZIMUTH, AZIMUTH_RANGE, ObservationEvent, RANGE
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.events import AZIMUTH, AZIMUTH_RANGE, ObservationEvent, RANGE, RANGES
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.sensor_mounting import (
     directions_of,
@@ -29,6 +29,7 @@ from slam_observer_ros.lie.sensor_mounting import (
     MEASURED,
     Sensed,
     UNMEASURED_M,
+    without_bias,
 )
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.smoothing.relinearisation import Placed
@@ -102,6 +103,15 @@ class WaitingView:
         """Whether only the distance was measured."""
         return self.kind == RANGE
 
+    @property
+    def anchors(self) -> IntArray:
+        """(1,) which landmark's bias is in it, −1 for none."""
+        return np.array([self.landmark_id if self.kind in RANGES else -1])
+
+    def biases_m(self, state: State) -> FloatArray:
+        """Return by how much (1,) its range is too long."""
+        return state.calibration.biases(self.anchors)[0]
+
     def is_near(self, other: WaitingView, times: float = 1.0) -> bool:
         """Return whether the robot has moved less than it takes between this view and another."""
         way = se3.log(se3.inverse(self.pose) @ other.pose)
@@ -112,7 +122,8 @@ class WaitingView:
         """Return where the sensor was, and its line of sight as calibrated now: (3,) each."""
         R, shift, scale = sensor_values(state, self.sensor_frame)
         flat = np.array([1.0, 1.0, float(state.axes.point == 3)])
-        origin, line = (self.mount + shift) * flat, scale * (R @ self.shown) * flat
+        shown = without_bias(self.shown[None], self.biases_m(state))[0] * self.shown
+        origin, line = (self.mount + shift) * flat, scale * (R @ shown) * flat
         turn = self.pose[:3, :3]
         return turn @ origin + self.pose[:3, 3], turn @ line
 
@@ -251,6 +262,7 @@ class WaitingRoom:
         if seen < self._next.get(landmark_id, 0):
             return None
         self._next[landmark_id] = min(math.ceil(TRY_AGAIN * seen), seen + MOST_BETWEEN)
+        state.calibrate_ranges(view.anchors)
         poses = state.relinearisation.poses_of(each.number for each in views)
         now = [
             each if pose is None else replace(each, pose=pose)
@@ -283,8 +295,9 @@ class WaitingRoom:
         k, of_point = state.axes.point, np.zeros((3, 3))
         of_point[:k, :k] = place.covariance
         turned = R.T @ view.pose[:3, :3].T
-        line = turned @ (place.point - view.seen(state)[0])
-        return line / scale, turned @ of_point @ turned.T / scale**2
+        line = turned @ (place.point - view.seen(state)[0]) / scale
+        line = line * without_bias(line[None], -view.biases_m(state))[0]
+        return line, turned @ of_point @ turned.T / scale**2
 
     def _placed(
         self,
@@ -361,7 +374,8 @@ def _as_seen(state: State, views: list[WaitingView]) -> Keyframe:
     sensed = None
     if calibration.corrects_points:
         numbers = [calibration.sensors.index(each.sensor_frame) for each in views]
-        sensed = Sensed(np.array(numbers), mounts, shown)
+        anchors = np.concatenate([each.anchors for each in views])
+        sensed = Sensed(np.array(numbers), mounts, shown, anchors)
     since_s = np.diff([each.stamp_ns for each in views]) * 1e-9
     repeated = state.observation_noise.repetitions(np.append(np.inf, since_s))
     return Keyframe(
@@ -405,7 +419,10 @@ class _PlaceProblem:
         self._axis[~self._is_range[at]] += 1
         variances = np.array([view.variances for view in views])
         self._variances = variances[at, self._axis]
-        # What is common to two views is the way from the later one of them until now.
+        # What is common to ranges is their bias …
+        ranges = self._is_range[at] * state.calibration.range_bias_m
+        self._biases = np.outer(ranges, ranges)
+        # … and to two views the way from the later one of them until now.
         self._ways = (walk - np.array([view.walk for view in views]))[at]
 
     def solve(self) -> list[Placed]:
@@ -479,7 +496,7 @@ class _PlaceProblem:
         # A turn ω and shift of the frame of the view move p − o by −(ω × p + shift).
         g = np.concatenate([-np.cross(p[:, None], H), -H], axis=2)
         later = np.triu(g @ np.einsum('qij,bqj->biq', self._ways, g))
-        R = later + np.triu(later, 1).transpose(0, 2, 1)
+        R = later + np.triu(later, 1).transpose(0, 2, 1) + self._biases
         R[:, np.arange(len(self._at)), np.arange(len(self._at))] += self._variances
         return e, H, R
 

@@ -111,13 +111,13 @@ def random_smoother(rng):
 
 def random_sensed(rng, points, c):
     """Return points (M, 3) of two sensors, of which the last of c entries are estimated."""
-    M, count = len(points), int(rng.integers(0, min(c, 14) + 1))
-    columns = np.full((2, 7), -1)
-    places = rng.permutation(14)[:count]
+    M, count = len(points), int(rng.integers(0, min(c, 16) + 1))
+    columns = np.full((2, 8), -1)
+    places = rng.permutation(16)[:count]
     columns.flat[places] = np.arange(c - count, c)
     origins = 0.2 * rng.standard_normal((M, 3))
-    sensed = Sensed(rng.integers(0, 2, M), origins, points - origins)
-    return SensedPoints(sensed, 0.05 * rng.standard_normal((2, 7)), columns, c)
+    sensed = Sensed(rng.integers(0, 2, M), origins, points - origins, np.full(M, -1))
+    return SensedPoints(sensed, 0.05 * rng.standard_normal((2, 8)), columns, c)
 
 
 def calls(compiled, rng):

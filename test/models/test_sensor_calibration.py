@@ -66,7 +66,7 @@ def calibrated(settings):
         replace(settings, angular_bias_stddev=NONE, velocity_delay_stddev=0.0),
         axes_of(settings.two_d_mode),
     )
-    calibration.add_sensor('')
+    calibration.add('')
     return calibration
 
 
@@ -79,11 +79,13 @@ def observation(rng, m=5, **changes):
 @pytest.mark.parametrize('is_depth', [False, True])
 @given(rng=generators())
 def test_derivatives_of_a_corrected_point_are_those_of_differences(settings, is_depth, rng):
-    settings = replace(settings, range_is_depth=is_depth)
-    calibration = calibrated(settings)
+    settings = replace(settings, range_is_depth=is_depth, range_bias_stddev=0.2)
+    calibration, anchors = calibrated(settings), np.array([-1, 7, -1, 4, 7])
+    for anchor in calibration.without_bias(anchors).tolist():
+        calibration.add(anchor)
     calibration.shift(0.1 * rng.normal(size=calibration.count))
     event = observation(rng, sensor=np.tile([0.3, 0.1, 0.5], (5, 1)))
-    seen, h = sensing.calibrated(calibration, settings, event), 1e-6
+    seen, h = sensing.calibrated(calibration, settings, event, anchors), 1e-6
     D = sensing.point_sensitivity(calibration, seen, seen.points)
     for column, unit in enumerate(np.eye(calibration.count)):
         calibration.shift(h * unit)

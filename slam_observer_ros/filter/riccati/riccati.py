@@ -129,9 +129,9 @@ class RiccatiGains(OrientationGains):
         """See to it that landmarks (m,) are in P."""
         self.joint.activate(rows)
 
-    def add_sensor(self, frame: str) -> None:
-        """Let the calibration of the sensor of another frame be part of the state, and of P."""
-        variances = self.calibration.add_sensor(frame)
+    def calibrate(self, of: str | int) -> None:
+        """Let the calibration of another frame's sensor be part of the state, and of P."""
+        variances = self.calibration.add(of)
         if len(variances):
             self.joint = self.joint.dense()
             self.joint.add_calibration(variances)
