@@ -10,6 +10,7 @@ import pytest
 from slam_observer_ros.common.types import FIRST_AUTOMATIC_ID
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.estimator.placement import make_gains
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.landmark_table import ERROR, SURE
 from slam_observer_ros.lie import se3
@@ -17,6 +18,7 @@ from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking.hypotheses import Hypotheses
 from slam_observer_ros.tracking.state import State
+from slam_observer_ros.tracking.step import step
 
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
 LOOP_NS = 100 * 10**9
@@ -121,6 +123,21 @@ def test_landmarks_that_may_be_one_are_followed_as_one_and_as_two():
     assert 0.0 < hypotheses._all[1].cost < 2.0 * SURE
     hypotheses.fork(closure.twins)
     assert [len(one.state.landmarks) for one in hypotheses._all] == [17, 18]
+
+
+@pytest.mark.parametrize(('apart_m', 'left'), [(0.11, 18), (0.0, 17)])
+def test_a_merger_that_later_views_contradict_is_undone(apart_m, left):
+    """Both are followed; then both are seen, or one alone."""
+    state = twins(0.11)
+    state.set_pose(se3.from_rpy((14.0, 15.0, 0.0, 0.0, 0.0, 0.0)), np.zeros((6, 6)))
+    hypotheses = after_a_search(state, LoopClosure())
+    assert len(hypotheses) == 2
+    points = np.array([1.055, 0.0, 0.0]) + np.outer([-0.5, 0.5], [apart_m, 0.0, 0.0])
+    for stamp_ns in range(10, 30):
+        seen = points if apart_m else points[:1]
+        event = ObservationEvent(stamp_ns, np.full(len(seen), UNKNOWN_ID), seen)
+        step(hypotheses, lambda seen: seen, event)
+    assert len(hypotheses.best.landmarks) == left
 
 
 @pytest.mark.parametrize(('apart_m', 'merged'), [(0.02, 1), (0.3, 0)])
