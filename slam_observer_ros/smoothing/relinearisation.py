@@ -100,78 +100,34 @@ class Owner(Protocol):
         """The errors, which are known where anything is relinearised."""
 
 
-class Past:
-    """The past of a filter that relinearises nothing: nothing of it is kept."""
+class NoPast:
+    """The past of a filter that relinearises nothing: as :class:`Relinearisation`, but empty."""
 
-    @property
-    def is_active(self) -> bool:
-        """Whether there is a history."""
-        return False
+    is_active = False
 
-    def copy(self, owner: Owner) -> Past:
+    def copy(self, _owner: Owner) -> NoPast:
         """Return an independent copy for a copy of its owner."""
         return self
 
-    def reset(self, since: str) -> None:
-        """Begin a new history with the present estimate; ``since`` says why, in words."""
+    def reset(self, *_: object) -> None:
+        """Keep nothing of what is noted."""
 
-    def move(self, start: FloatArray, motion: Advanced, interval: Interval) -> None:
-        """Note a motion of the robot from a pose (4, 4)."""
-
-    def slip(self, start: FloatArray, motion: Advanced) -> None:
-        """Note a slip from a pose (4, 4), which may not have happened."""
-
-    def know_calibration(self, r: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        """Note how far the calibration is off: r = H c̃ + noise, R (q, q)."""
-
-    def note_correction(self, before: FloatArray, after: FloatArray) -> None:
-        """Note a correction that turned the robot from Â to another (4, 4)."""
-
-    def add(self, keyframe: Keyframe, in_doubt: bool) -> None:
-        """Add a keyframe, of a landmark ``in_doubt`` or none."""
-
-    def mark(self, mark: int, stamp_ns: int) -> None:
-        """Mark an observation of landmarks that may be known later by a number."""
+    move = slip = know_calibration = note_correction = add = mark = enter = reset
+    add_calibration = relocate = forget_orientations = remove = merge = reset
 
     def poses_of(self, marks: Iterable[int]) -> list[FloatArray | None]:
-        """Return the poses (4, 4) of marked observations; None where that is not known."""
+        """Return the poses (4, 4) of marked observations, which are not known."""
         return [None for _ in marks]
 
-    def placed(self, points: FloatArray, seen: Sequence[Keyframe]) -> Placed | None:
-        """Return where a landmark is that was ``seen`` in marked observations, near a point (3,).
-
-        By all that was seen since the summary. None where that is not kept, or leaves it open.
-        """
-        return None
-
-    def enter(self, row: int, seen: Keyframe) -> None:
-        """Let marked observations (m,) be all that a landmark was ``seen`` in."""
-
-    def add_calibration(self) -> None:
-        """Note entries of the calibration that are estimated from now on."""
-
-    def relocate(self, rows: IntArray) -> None:
-        """Forget all about landmarks (m,) but their latest observation."""
-
-    def forget_orientations(self, rows: IntArray) -> None:
-        """Forget how landmarks (m,) are turned."""
-
-    def remove(self, rows: IntArray) -> None:
-        """Forget landmarks; those behind move up."""
-
-    def merge(self, rows: IntArray, copies: IntArray) -> None:
-        """Take landmarks ``copies`` (m,) for ``rows`` (m,), as the filter has done."""
+    def placed(self, *_: object) -> None:
+        """Return where a landmark is, which is not known."""
 
     def smooth(self) -> tuple[Step, int, History]:
-        """Return the last step of smoothing, how many slips it confirms, and what it is of.
-
-        Raise :exc:`ParameterError` if what the smoother takes for constant is not, or no history
-        is kept, :exc:`SmoothingError` if the observations don't determine everything.
-        """
+        """Raise :exc:`ParameterError`, as no history is kept."""
         raise ParameterError(NO_HISTORY)
 
 
-class Relinearisation(Past):
+class Relinearisation:
     """Keeps the ``history`` of a filter since a prior, and relinearises it when it is due.
 
     Relinearising changes the observer and the covariance of ``errors``, and the ``calibration``.
@@ -371,9 +327,11 @@ class Relinearisation(Past):
             self._clear_counts()
 
     def smooth(self) -> tuple[Step, int, History]:
-        """Return the last step of smoothing, and how many slips it confirms.
+        """Return the last step of smoothing, how many slips it confirms, and what it is of.
 
-        Its estimates are iterated from the present ones, which stay as they are.
+        Its estimates are iterated from the present ones, which stay as they are. Raise
+        :exc:`ParameterError` if what the smoother takes for constant is not, or no history is
+        kept, :exc:`SmoothingError` if the observations don't determine everything.
         """
         if self._settings.relinearization_interval == 0:
             raise ParameterError(NO_HISTORY)

@@ -19,7 +19,7 @@ from slam_observer_ros.lie.matrices import correlations_of
 from slam_observer_ros.models.held_velocities import Velocities
 from slam_observer_ros.models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.relinearisation import Past, Relinearisation
+from slam_observer_ros.smoothing.relinearisation import NoPast, Relinearisation
 from slam_observer_ros.tracking import covariances
 
 OLD_NEWS = 10.0
@@ -40,7 +40,7 @@ class State:
         # How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it.
         is_ignored = 'landmark_velocity_stddev' in gains.ignores
         self.landmark_velocity_stddev = 0.0 if is_ignored else settings.landmark_velocity_stddev
-        self.relinearisation = Past()
+        self.relinearisation: NoPast | Relinearisation = NoPast()
         if self.errors is not None and not self.landmark_velocity_stddev:
             self.relinearisation = Relinearisation(self.errors, self.calibration, settings)
         self.counts = Outcomes()  # landmarks rejected, moved, forgotten and so on
@@ -219,7 +219,7 @@ class State:
         """Take all landmarks for exact and at rest where a map has them."""
         self.gains.fix_landmarks(known)
         self.landmark_velocity_stddev = 0.0
-        self.relinearisation = Past()  # there is no drift to undo
+        self.relinearisation = NoPast()  # there is no drift to undo
 
     def smooth(self) -> Smoothed:
         """Return the smoothed trajectory and map; see :meth:`.Relinearisation.smooth`."""
