@@ -32,8 +32,7 @@ def transpose(M: FloatArray) -> FloatArray:
 
 def symmetric(P: FloatArray) -> FloatArray:
     """Return P (…, q, q) without the skew part that rounding has left in it."""
-    half: FloatArray = 0.5 * (P + transpose(P))
-    return half
+    return 0.5 * (P + transpose(P))
 
 
 def solve(S: FloatArray, right: FloatArray) -> FloatArray:
@@ -215,8 +214,7 @@ def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
     # Rounding may have left a variance a hair below zero.
     deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
     scales = largest / np.maximum(deviations, largest)
-    scaled: FloatArray = covariances * scales[..., :, None] * scales[..., None, :]
-    return scaled
+    return covariances * scales[..., :, None] * scales[..., None, :]
 
 
 def are_covariances(matrices: FloatArray) -> BoolArray:

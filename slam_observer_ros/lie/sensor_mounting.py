@@ -73,8 +73,7 @@ def shown_at(values: FloatArray, sensed: Sensed) -> FloatArray:
     R, scales = so3.exp(values[..., :3]), np.exp(values[..., 6:7])
     scales = scales * without_bias(sensed.arms, values[..., 7])
     turned = (R @ sensed.arms[:, :, None])[:, :, 0]
-    points: FloatArray = sensed.origins + values[..., 3:6] + scales * turned
-    return points
+    return sensed.origins + values[..., 3:6] + scales * turned
 
 
 def without_bias(arms: FloatArray, biases: FloatArray) -> FloatArray:
@@ -110,8 +109,7 @@ def directions_of(lines: FloatArray) -> FloatArray:
     azimuth = np.column_stack([-along[:, 1] / flat, along[:, 0] / flat, np.zeros(len(lines))])
     azimuth[level < _TINY**0.5] = [0.0, 1.0, 0.0]
     elevation = np.cross(along, azimuth)
-    directions: FloatArray = np.stack([along, azimuth, elevation], axis=1)
-    return directions
+    return np.stack([along, azimuth, elevation], axis=1)
 
 
 def unmeasured_covariances(directions: FloatArray) -> FloatArray:

@@ -17,11 +17,7 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray
 
 _HAT = np.array(
-    [
-        [0, 0, 0, 0, 0, -1, 0, 1, 0],
-        [0, 0, 1, 0, 0, 0, -1, 0, 0],
-        [0, -1, 0, 1, 0, 0, 0, 0, 0],
-    ],
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
     dtype=np.float64,
 )
 _IDENTITY = np.eye(3)
@@ -166,11 +162,9 @@ def exact(R: FloatArray) -> FloatArray:
     """
     off = np.abs(R.swapaxes(-1, -2) @ R - _IDENTITY).max(axis=(-2, -1), keepdims=True)
     near = normalise(normalise(normalise(R)))
-    rotations: FloatArray = np.where(off > ROUNDING, near, R)
-    return rotations
+    return np.where(off > ROUNDING, near, R)
 
 
 def _square(K: FloatArray) -> FloatArray:
     """Return K K of matrices (…, 3, 3), of one at a third of what `@` costs."""
-    square: FloatArray = K.dot(K) if K.ndim == 2 else K @ K
-    return square
+    return K.dot(K) if K.ndim == 2 else K @ K

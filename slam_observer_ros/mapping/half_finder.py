@@ -17,12 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.filter.robust import (
-    HEAVY_TAIL,
-    huber_loss,
-    straight_odds,
-    straight_share,
-)
+from slam_observer_ros.filter.robust import HEAVY_TAIL, huber_loss, straight_odds, straight_share
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import EstimatedAxes, PLANAR
 from slam_observer_ros.lie.matrices import transpose
@@ -119,8 +114,7 @@ class HalfFinder:
     """
 
     def __init__(self, maps: Sequence[LandmarkMap]) -> None:
-        self._maps = maps
-        self._next = FEWEST_VIEWS
+        self._maps, self._next = maps, FEWEST_VIEWS
         self.rivals: list[FloatArray] = []
         self.in_a_line: list[int] = []
 

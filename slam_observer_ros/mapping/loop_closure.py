@@ -18,11 +18,7 @@ from slam_observer_ros.filter.landmark_table import LandmarkTable, SURE
 from slam_observer_ros.filter.robust import accepted
 from slam_observer_ros.lie.matrices import mahalanobis
 from slam_observer_ros.tracking.hypothesis import Twins
-from slam_observer_ros.tracking.joint_compatibility import (
-    JointSearch,
-    Pairs,
-    PRUNING_COST_OF_IDS,
-)
+from slam_observer_ros.tracking.joint_compatibility import JointSearch, Pairs, PRUNING_COST_OF_IDS
 from slam_observer_ros.tracking.state import State
 
 PERIOD_NS = 5_000_000_000  # time between two searches, nanoseconds

@@ -34,10 +34,7 @@ CONTRADICTION_SIGMAS = 4.0  # landmarks whose misfit is as improbable as this co
 
 
 def find_transform(
-    source: FloatArray,
-    source_covariance: FloatArray,
-    target: KnownLandmarks,
-    axes: EstimatedAxes,
+    source: FloatArray, source_covariance: FloatArray, target: KnownLandmarks, axes: EstimatedAxes
 ) -> tuple[FloatArray, BoolArray] | None:
     """Find the transform between the frames of two maps, even if some landmarks are wrong.
 

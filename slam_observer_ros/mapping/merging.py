@@ -18,11 +18,7 @@ from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.filter.known_landmarks import JITTER_M2, KnownLandmarks
 from slam_observer_ros.lie import se3
-from slam_observer_ros.lie.matrices import (
-    block_diagonal,
-    diagonal_blocks,
-    with_variances_above,
-)
+from slam_observer_ros.lie.matrices import block_diagonal, diagonal_blocks, with_variances_above
 from slam_observer_ros.mapping.landmark_map import LandmarkMap, MAX_CORRELATED
 from slam_observer_ros.mapping.map_alignment import find_transform
 from slam_observer_ros.tracking.state import State

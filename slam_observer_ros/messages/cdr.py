@@ -41,9 +41,7 @@ class CdrReader:
             raise MessageError(f'too short: {len(raw)} bytes hold no CDR header')
         if raw[0] != 0 or raw[1] > 1:
             raise MessageError(f'not plain CDR: encapsulation {bytes(raw[:2]).hex()}')
-        self._raw = raw
-        self.receive_ns = receive_ns
-        self._position = ENCAPSULATION_BYTES
+        self._raw, self.receive_ns, self._position = raw, receive_ns, ENCAPSULATION_BYTES
         self._byte_order = '<' if raw[1] else '>'
 
     def _take(self, size: int, alignment: int) -> int:

@@ -17,12 +17,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import BEARING, MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.clouds import is_measured, skip_cloud
-from slam_observer_ros.messages.fiducials import (
-    as_arrays,
-    NESTED,
-    observed_poses,
-    orientations_of,
-)
+from slam_observer_ros.messages.fiducials import as_arrays, NESTED, observed_poses, orientations_of
 from slam_observer_ros.messages.poses import PoseMessage
 from slam_observer_ros.messages.registry import Decoder, reads
 
@@ -360,5 +355,4 @@ def _from_fisheye(shown: FloatArray, distortion: FloatArray) -> FloatArray:
         off = np.abs(angle * (1.0 + angle[:, None] ** powers @ k) - radius)
         angle = np.where((off < 1e-6) & (angle >= 0.0) & (angle <= np.pi), angle, np.nan)
         around = np.where(radius[:, None] > 0.0, shown / radius[:, None], 0.0)
-    directions: FloatArray = np.column_stack([np.sin(angle)[:, None] * around, np.cos(angle)])
-    return directions
+    return np.column_stack([np.sin(angle)[:, None] * around, np.cos(angle)])

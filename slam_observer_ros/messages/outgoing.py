@@ -54,8 +54,7 @@ class OutgoingMessages:
     def __init__(
         self, class_of: Callable[[str], Callable[..., Any]], octets: Callable[[bytes], Any]
     ) -> None:
-        self._class_of = class_of
-        self.octets = octets
+        self._class_of, self.octets = class_of, octets
 
     def time(self, stamp_ns: int) -> Any:
         """Make a builtin_interfaces/Time."""
@@ -290,8 +289,7 @@ class EstimateMessages:
     """
 
     def __init__(self, messages: OutgoingMessages, map_frame: str) -> None:
-        self._messages = messages
-        self._map_frame = map_frame
+        self._messages, self._map_frame = messages, map_frame
 
     def path_pose(self, stamp_ns: int, pose: FloatArray) -> Any:
         """Make one pose of the path."""

@@ -55,11 +55,7 @@ class Decoder(Generic[MessageT_co]):
 
 
 def reads(
-    *names: str,
-    role: Role,
-    package: str = '',
-    definition: str = '',
-    is_ambiguous: bool = False,
+    *names: str, role: Role, package: str = '', definition: str = '', is_ambiguous: bool = False
 ) -> Callable[[Callable[[CdrReader], MessageT]], Decoder[MessageT]]:
     """Register the decorated function as what reads types such as ``geometry_msgs/msg/Twist``.
 

@@ -169,14 +169,12 @@ class Calibration:
     @property
     def values(self) -> FloatArray:
         """(c,) estimates: scale factors 1 + s, biases b, the delay τ in seconds; then sensors'."""
-        values: FloatArray = self._owner.calibration.take(self._places)
-        return values
+        return self._owner.calibration.take(self._places)
 
     @property
     def rates(self) -> FloatArray:
         """(6, 7) [M b], as a view."""
-        rates: FloatArray = self._owner.calibration[:DELAY].reshape(6, 7)
-        return rates
+        return self._owner.calibration[:DELAY].reshape(6, 7)
 
     @property
     def delay_ns(self) -> int:
@@ -191,8 +189,7 @@ class Calibration:
     def sensor(self, frame: str) -> FloatArray:
         """Return ψ, d and s (7,) of a sensor, as a view."""
         first, _ = self._begins[frame]
-        values: FloatArray = self._owner.calibration[first : first + EACH]
-        return values
+        return self._owner.calibration[first : first + EACH]
 
     def columns(self, frame: str) -> slice:
         """Return which of the c entries belong to a sensor."""
@@ -280,8 +277,7 @@ class Calibration:
 
     def _rates(self, measured_velocities: FloatArray) -> FloatArray:
         """Return (k, …) how fast each entry of [M b] moves the robot per unit of its error."""
-        rates: FloatArray = with_moves(measured_velocities).take(self._columns, axis=1)
-        return rates
+        return with_moves(measured_velocities).take(self._columns, axis=1)
 
     def at_rest(self, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how fast the robot turns by a gyroscope's ``rate`` (3,): (q,), and H (q, c).

@@ -30,12 +30,7 @@ import numpy as np
 from slam_observer_ros.common.errors import significant
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import MotionFactor
-from slam_observer_ros.lie.matrices import (
-    diagonal_blocks,
-    limited,
-    mahalanobis,
-    solve_definite,
-)
+from slam_observer_ros.lie.matrices import diagonal_blocks, limited, mahalanobis, solve_definite
 from slam_observer_ros.models.held_velocities import averaged, HeldVelocities
 from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
@@ -248,12 +243,7 @@ class MotionFactors:
 
 
 def learn(
-    factors: Factors,
-    r: FloatArray,
-    S: FloatArray,
-    C: FloatArray,
-    degrees: IntArray,
-    gate: float,
+    factors: Factors, r: FloatArray, S: FloatArray, C: FloatArray, degrees: IntArray, gate: float
 ) -> None:
     """Let factors learn from residuals r (m, k), with S (m k, m k) and C (m, k, p).
 
@@ -273,12 +263,7 @@ def learn(
 
 
 def gated_score(
-    r: FloatArray,
-    S: FloatArray,
-    C: FloatArray,
-    N: FloatArray,
-    degrees: IntArray,
-    gate: float,
+    r: FloatArray, S: FloatArray, C: FloatArray, N: FloatArray, degrees: IntArray, gate: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return g (2,) and F (2, 2) of residuals r (m, k), without some few that are too far off."""
     solved = solve_definite(S, np.column_stack([r.ravel(), C]))

@@ -65,8 +65,7 @@ def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
     if error_time_s == 0.0:
         return np.ones(len(dt_s))
     new = -np.expm1(-np.maximum(dt_s, MIN_INTERVAL_S) / error_time_s)  # 1 − c
-    factors: FloatArray = (2.0 - new) / new
-    return factors
+    return (2.0 - new) / new
 
 
 def point_covariances(lines_of_sight: FloatArray, figures: PointFigures) -> FloatArray:

@@ -62,11 +62,7 @@ def calibrated(
     if directions is not None:
         directions = directions @ R.T
     event = replace(
-        event,
-        covariances=covariances,
-        directions=directions,
-        velocities=velocities,
-        sensed=sensed,
+        event, covariances=covariances, directions=directions, velocities=velocities, sensed=sensed
     )
     return calibrated_again(calibration, event)
 

@@ -112,5 +112,4 @@ def _overlaps(stamps: IntArray, spans_ns: IntArray, known_ns: list[int]) -> IntA
     bounds[:, :-1] = np.where(stamps > np.array(known_ns)[:, None], end, stamps)
     bounds[:, -1:] = end
     bounds = np.minimum(np.maximum(bounds, start), end)
-    overlaps: IntArray = bounds[:, 1:] - bounds[:, :-1]
-    return overlaps
+    return bounds[:, 1:] - bounds[:, :-1]

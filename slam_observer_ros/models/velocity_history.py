@@ -60,8 +60,7 @@ class VelocityHistory:
     def __init__(
         self, timeout_ns: int, is_planar: bool = False, bias: FloatArray | None = None
     ) -> None:
-        self._timeout_ns = timeout_ns
-        self._is_planar = is_planar
+        self._timeout_ns, self._is_planar = timeout_ns, is_planar
         # In force from each stamp to the next; the first one is in force before any event.
         self._joined, self._count = _Joined.with_room_for(FIRST_CAPACITY), 1
         self._angular: AngularVelocityEvent | None = None

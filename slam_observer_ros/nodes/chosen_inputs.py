@@ -113,8 +113,7 @@ class CloudDecoder:
     """
 
     def __init__(self, node: Node, message_type: str) -> None:
-        self._node = node
-        self._message_type = message_type
+        self._node, self._message_type = node, message_type
         self._decode: Decode[ObservationEvent] = decoders('landmarks')[message_type]
         self._is_checked = False
 
@@ -174,8 +173,7 @@ class TagDecoder:
     """Decodes fiducials on /tf, and warns once if no frame is named as they are."""
 
     def __init__(self, node: Node, tag_frame_prefix: str) -> None:
-        self._node = node
-        self._prefix = tag_frame_prefix
+        self._node, self._prefix = node, tag_frame_prefix
         self._warn_at_s = time.monotonic() + WITHOUT_TAG_S
         self._is_checked = False
         self._frames: set[str] = set()

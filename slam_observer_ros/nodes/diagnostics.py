@@ -49,9 +49,7 @@ class LocalisationStatus:
     def __init__(
         self, node: Node, settings: ObserverNodeSettings, estimator: Estimate, noise: NoiseFit
     ) -> None:
-        self._node = node
-        self._settings = settings
-        self._estimator = estimator
+        self._node, self._settings, self._estimator = node, settings, estimator
         self._noise = noise
         self._log = ThrottledLog(node)
         self._is_localised: bool | None = None
@@ -179,13 +177,9 @@ class DiagnosticsPublisher:
         watch: MistakeWatch,
         hardware_id: str,
     ) -> None:
-        self._node = node
-        self._hardware_id = hardware_id
-        self._estimator = estimator
-        self._feed = feed
-        self._inputs = inputs
-        self._estimate_publisher = estimate_publisher
-        self._localisation = localisation
+        self._node, self._hardware_id, self._estimator = node, hardware_id, estimator
+        self._feed, self._inputs = feed, inputs
+        self._estimate_publisher, self._localisation = estimate_publisher, localisation
         self._watch = watch
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()

@@ -99,8 +99,7 @@ class EstimatePublisher:
         estimator: Estimate,
         buffer: TransformBuffer,
     ) -> None:
-        self._node = node
-        self._settings = settings
+        self._node, self._settings = node, settings
         self._log = ThrottledLog(node)
         self._estimator = estimator
         self._messages = EstimateMessages(MESSAGES, settings.map_frame)

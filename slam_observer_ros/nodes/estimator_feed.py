@@ -14,12 +14,7 @@ from rclpy.node import Node
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.stamps import to_ns
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import (
-    AngularVelocityEvent,
-    Event,
-    ObservationEvent,
-    VelocityEvent,
-)
+from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import scan_problem
 from slam_observer_ros.nodes.ros_node import described, ThrottledLog
 from slam_observer_ros.recordings.event_builder import (
@@ -134,9 +129,7 @@ class EstimatorFeed:
         on_waiting: Callable[[], None],
         note_event: Callable[[Event], None],
     ) -> None:
-        self._node = node
-        self._settings = settings
-        self._estimator = estimator
+        self._node, self._settings, self._estimator = node, settings, estimator
         self._builder = EventBuilder(
             base_frame,
             settings.transform_timeout,

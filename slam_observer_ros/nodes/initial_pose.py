@@ -57,11 +57,8 @@ class InitialPoseListener:
         odometry: TransformedOdometry,
         on_move: Callable[[], None],
     ) -> None:
-        self._node = node
-        self._odometry = odometry
-        self._map_frame = map_frame
-        self._estimator = estimator
-        self._on_move = on_move
+        self._node, self._odometry, self._map_frame = node, odometry, map_frame
+        self._estimator, self._on_move = estimator, on_move
         for topic in TOPICS:
             node.create_subscription(
                 PoseWithCovarianceStamped, topic, self._receive, RELIABLE_QOS, raw=True
@@ -183,8 +180,7 @@ class KeptPose:
         self._restored: StoredPose | None = None  # until odometry says how the robot has moved
         self._log = ThrottledLog(node)
         self._logger = node.get_logger()
-        self._settings = settings
-        self._estimator = estimator
+        self._settings, self._estimator = settings, estimator
         self._path = absolute(settings.pose_file) if settings.pose_file else None
         self._stamp_ns: int | None = None
 

@@ -168,9 +168,7 @@ class InputTopic:
         qos: QoSProfile,
         max_wait_s: float = math.inf,
     ) -> None:
-        self._node = node
-        self._decoders = decoders
-        self._on_message = on_message
+        self._node, self._decoders, self._on_message = node, decoders, on_message
         self._qos = qos
         # Whether messages were taken that are still to be used: all else that waits came later.
         self.has_more = False

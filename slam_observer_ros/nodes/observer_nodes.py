@@ -229,8 +229,7 @@ class ObserverCore:
                 on_clock_change=False,
             ),
             post_callback=node.guarded(
-                lambda jump: flow.handle_clock_jump(jump.delta.nanoseconds),
-                'a jump of the clock',
+                lambda jump: flow.handle_clock_jump(jump.delta.nanoseconds), 'a jump of the clock'
             ),
         )
         changed = len(changed_names(estimator_settings)) + len(changed_names(settings))
@@ -330,8 +329,7 @@ class LifecycleBond:
     """
 
     def __init__(self, node: Node, heartbeat_period_s: float) -> None:
-        self._node = node
-        self._period_s = heartbeat_period_s
+        self._node, self._period_s = node, heartbeat_period_s
         self._bond: Any = None
         if heartbeat_period_s:
             try:

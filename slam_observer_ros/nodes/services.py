@@ -45,8 +45,7 @@ class PausedMotion:
     """
 
     def __init__(self, estimator: Estimator, odometry: TransformedOdometry) -> None:
-        self._estimator = estimator
-        self._odometry = odometry
+        self._estimator, self._odometry = estimator, odometry
         self._correction: FloatArray | None = None
 
     def begin(self) -> None:
@@ -98,9 +97,7 @@ class ControlServices:
         publisher: EstimatePublisher,
         odometry: TransformedOdometry,
     ) -> None:
-        self._node = node
-        self._estimator = estimator
-        self._feed = feed
+        self._node, self._estimator, self._feed = node, estimator, feed
         self._publisher = publisher
         self._paused_motion = PausedMotion(estimator, odometry)
         node.create_service(Trigger, '~/reset', self._reset)
@@ -171,8 +168,7 @@ class MapServices:
         self._node = node
         self._map_frame = settings.map_frame
         self._autosave = settings.autosave_map
-        self._estimator = estimator
-        self._on_load = on_load
+        self._estimator, self._on_load = estimator, on_load
         # For an end within a long observation: a map at hand, and whether the end has come.
         self._recent: tuple[LandmarkMap, int] | None = None
         self._recent_s = self._next_s = 0.0

@@ -51,8 +51,7 @@ class LiveTransforms:
         own: tuple[str, str],
         sent: PoseBroadcaster | None = None,
     ) -> None:
-        self._node = node
-        self._buffer = buffer
+        self._node, self._buffer = node, buffer
         self._own, self._sent = own, sent
         self._log = ThrottledLog(node)
         self._dynamic: Subscription | None = None
@@ -181,9 +180,7 @@ class PoseBroadcaster:
         transforms: TransformBuffer,
         reorder_window_s: float,
     ) -> None:
-        self._node = node
-        self._settings = settings
-        self._transforms = transforms
+        self._node, self._settings, self._transforms = node, settings, transforms
         self._log = ThrottledLog(node)
         self._publisher = TransformPublisher(node, '/tf', RELIABLE_QOS)
         self._tolerance_ns = to_ns(settings.transform_tolerance)

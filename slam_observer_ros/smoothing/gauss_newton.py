@@ -36,12 +36,7 @@ from slam_observer_ros.smoothing.bordered_chain import (
     landmark_columns,
 )
 from slam_observer_ros.smoothing.keyframes import inverse, Keyframes, Solution
-from slam_observer_ros.smoothing.observations import (
-    NO_SENSORS,
-    normal,
-    Observations,
-    SensedPoints,
-)
+from slam_observer_ros.smoothing.observations import NO_SENSORS, normal, Observations, SensedPoints
 from slam_observer_ros.smoothing.prior import Prior
 
 
@@ -75,9 +70,7 @@ class Smoother:
         settings: Settings,
         sensed: SensedPoints | None = None,
     ) -> None:
-        self._axes = axes
-        self._prior = prior
-        self._keyframes = keyframes
+        self._axes, self._prior, self._keyframes = axes, prior, keyframes
         self._settings, self._sensed = settings, sensed
         self._observations = Observations(axes, keyframes, settings, sensed)
         self._unknowns = axes.point + axes.turn  # of a landmark: its position, then its turn

@@ -212,16 +212,10 @@ class Observations:
 
     def _calibrations(self, solution: Solution) -> FloatArray:
         """Return the calibration (M, c) with which each point was seen."""
-        calibrations: FloatArray = solution.calibrations[self._keyframes.keyframes + 1]
-        return calibrations
+        return solution.calibrations[self._keyframes.keyframes + 1]
 
     def _of_turns(
-        self,
-        solution: Solution,
-        R: FloatArray,
-        chained: int,
-        counted: FloatArray,
-        gated: bool,
+        self, solution: Solution, R: FloatArray, chained: int, counted: FloatArray, gated: bool
     ) -> tuple[FloatArray, FloatArray]:
         """Return what T orientations say, seen from poses turned by ``R`` (T, 3, 3).
 
@@ -300,8 +294,7 @@ def _expected(
     known[:, 1:] *= ((lengths[0] / lengths[1]) ** 2)[:, None]
     along = np.where(MEASURED[kinds], known, known.max(axis=1, keepdims=True))
     known = np.where(measured_axes(shown, expected, kinds), along, UNMEASURED_M**-2)
-    turned: FloatArray = transpose(new) @ (known[:, :, None] * new)
-    return turned
+    return transpose(new) @ (known[:, :, None] * new)
 
 
 def normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -312,5 +305,4 @@ def normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray,
 
 def _squared_distances(error: FloatArray, information: FloatArray) -> FloatArray:
     """Return the squared Mahalanobis distances (M,) of errors (M, k)."""
-    squared: FloatArray = (error[:, None, :] @ information @ error[:, :, None])[:, 0, 0]
-    return squared
+    return (error[:, None, :] @ information @ error[:, :, None])[:, 0, 0]
