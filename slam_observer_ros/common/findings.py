@@ -84,6 +84,8 @@ _TEXTS = {
         'the driver, or whether it is the sensor that looks backwards',
     'no_turning': 'the angular velocity is always zero, but the robot turns → see whether the '
         'driver fills it in, or set use_imu for the one of an IMU',
+    'mount_off': '{sensor} looks mounted {off} {towards} than /tf says → set '
+        'sensor_rotation_stddev to how far that may be off, or calibrate (Calibrate a sensor)',
     # Times of the inputs
     'silence': 'no {input} on {topic} for {silence_s:.1f} s of {duration_s:.1f} s '
         '(velocity_timeout): {consequence} → see whether its driver stopped, or messages were '
@@ -300,7 +302,7 @@ _TEXTS = {
 """By kind: what is wrong, with names in braces for figures, → and what to do."""
 
 MISTAKES = frozenset({
-    'no_turning', 'points_in_optical_axes', 'points_mirrored', 'points_backwards',
+    'no_turning', 'mount_off', 'points_in_optical_axes', 'points_mirrored', 'points_backwards',
     'points_in_millimetres', 'tag_size', 'turning_in_degrees', 'speed_in_kmh',
     'turning_negated', 'driving_negated',
 })  # fmt: skip

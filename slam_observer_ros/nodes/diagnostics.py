@@ -37,7 +37,7 @@ from slam_observer_ros.runs.health import (
     of_node,
     Progress,
 )
-from slam_observer_ros.runs.mistakes import Drive, Search
+from slam_observer_ros.runs.mistakes import Drive, leaves_mount_open, Search
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 FOUND_AGAIN = 0.8  # of the error level: near it the robot would be lost and found all the time
@@ -120,6 +120,9 @@ class MistakeWatch:
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._search: Search | None = None
         self._next_s = 0.0
+        # A mount shows by no symptom: it is looked at after a minute, and each twice as long.
+        self._pause_s = PAUSE_S
+        self._mount_s = time.monotonic() + PAUSE_S
         self.timer = node.create_steady_timer(PERIOD_S, self._advance)  # while a search goes on
         self.timer.cancel()
 
@@ -138,14 +141,20 @@ class MistakeWatch:
         """Begin to search if what was found, or named before, is reason for that."""
         if self._search is not None or time.monotonic() < self._next_s:
             return
+        settings, now_s = self._estimator.settings, time.monotonic()
         is_suspicious = has_slipped or any(each.kind in SUSPICIOUS for each in findings)
-        if not is_suspicious and not self.findings:
+        named = {each.kind for each in self.findings}
+        of_mount_only = not is_suspicious and named <= {'mount_off'}
+        if of_mount_only and (now_s < self._mount_s or not leaves_mount_open(settings)):
             return
         if (driven_s := Drive(self._events).driven_s) > LEAST_DRIVEN_S:
-            self._next_s = time.monotonic() + min(driven_s, PAUSE_S)
+            self._next_s = now_s + min(driven_s, PAUSE_S)
+            if of_mount_only:
+                self._mount_s = now_s + self._pause_s
+                self._pause_s *= 2.0
             maps = self._estimator.loaded_maps
             self._search = self._begin_search(
-                self._estimator.settings, list(self._events), maps or None
+                settings, list(self._events), maps or None, of_mount_only
             )
             self.timer.reset()
 

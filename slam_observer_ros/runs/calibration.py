@@ -34,6 +34,7 @@ from slam_observer_ros.models.sensing import cosines, LEAST_COSINE
 from slam_observer_ros.recordings.opening import sha256_of
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.trajectory import Truth
+from slam_observer_ros.runs.mistakes import ROTATION
 from slam_observer_ros.runs.recorders import Likelihood, LikelihoodRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.runs.result import Request
@@ -229,8 +230,8 @@ class Found:
         }
 
 
-ROTATION, TRANSLATION = (0.1,) * 3, (0.1,) * 3
-"""How a sensor may be mounted: some 6° and 10 cm off what is stated."""
+TRANSLATION = (0.1,) * 3
+"""How far from where it is stated a sensor may be mounted, metres."""
 
 SCALE, RANGE_BIAS_M, BIAS, DELAY_S = 0.1, 0.2, 0.02, 0.3
 """How far scales, of ranges and velocities, all ranges from one landmark, a gyroscope's zero

@@ -197,17 +197,20 @@ def of_calibration(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
     return findings
 
 
-def of_mounting(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
+def of_mounting(
+    calibration: Iterable[CalibrationEstimate], kind: str = 'mounting', usual: float = 0.0
+) -> list[Finding]:
     """Say what to set so that sensors are stated as they were found to be.
 
-    A property is found where it is three standard deviations off, and those have become a third.
+    A property is found where it is three standard deviations off what is ``usual``, and those
+    have become a third.
     """
     findings = []
     for part in calibration:
         name, _, frame = part.name.partition('/')
         mounted, _, axis = name.rpartition('_')
         off, sensor = part.value - part.nominal, frame or 'the sensor'
-        if abs(off) < 3.0 * part.deviation or 3.0 * part.deviation > part.stated:
+        if abs(off) < usual + 3.0 * part.deviation or 3.0 * part.deviation > part.stated:
             continue
         if name == 'range_scale':
             findings.append(found(name, sensor=sensor, found=part, value=part.value))
@@ -216,7 +219,7 @@ def of_mounting(calibration: Iterable[CalibrationEstimate]) -> list[Finding]:
             words, entry = MOUNTED[mounted]['xyz'.index(axis)]
             findings += rule(
                 True,
-                'mounting',
+                kind,
                 sensor=sensor,
                 off=f'{abs(factor * off):.2g} ± {factor * part.deviation:.2g} {unit}',
                 towards=words.split('/')[int(off < 0.0)],

@@ -21,7 +21,7 @@ import numpy as np
 from slam_observer_ros.common.findings import Finding, found, muted_warnings
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimates import CalibrationEstimate, Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -36,6 +36,7 @@ from slam_observer_ros.lie import so3
 from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.models.observation_noise import ObservationNoise
+from slam_observer_ros.runs.health import of_mounting
 from slam_observer_ros.runs.recorders import Likelihood, LikelihoodRecorder
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -158,6 +159,12 @@ PAIRS = tuple(
     for one, other in combinations([each for each in CORRECTIONS if not each.changes], 2)
     if one.goes_with(other)
 )
+
+ROTATION = (0.1,) * 3
+"""How far a sensor may be turned against what is stated, rad."""
+
+USUALLY_TURNED = 0.035
+"""How far brackets are turned as a rule, rad: settings state so, where it matters."""
 
 DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
 """Time of driving, and turns, that are looked at: who stands or goes straight on says little."""
@@ -295,14 +302,17 @@ LEAST_TURN_RAD = 1.0
 
 
 def mistakes(
-    settings: Settings, events: Iterable[Event], known: Maps | None = None
+    settings: Settings,
+    events: Iterable[Event],
+    known: Maps | None = None,
+    of_mount_only: bool = False,
 ) -> list[Finding]:
     """Name the mistakes of the set-up, two at most, that explain what was recorded; none if right.
 
     Points without ids, whose meaning depends on the set-up, are left out, and so are half points,
     of which other densities are compared. ``known`` are the maps in one of which the robot was.
     """
-    search = Search(settings, events, known)
+    search = Search(settings, events, known, of_mount_only)
     search.advance(math.inf)
     return search.findings
 
@@ -311,7 +321,11 @@ class Search:
     """Looks for mistakes as :func:`mistakes` does, a part at a time, as a live node can't wait."""
 
     def __init__(
-        self, settings: Settings, events: Iterable[Event], known: Maps | None = None
+        self,
+        settings: Settings,
+        events: Iterable[Event],
+        known: Maps | None = None,
+        of_mount_only: bool = False,
     ) -> None:
         self.findings: list[Finding] = []
         trial = replace(
@@ -322,7 +336,7 @@ class Search:
             max_hypotheses=1,
             relinearization_interval=0,
         )
-        self._steps = _named(trial, events, known)
+        self._steps = (_mount if of_mount_only else _named)(trial, events, known)
 
     def advance(self, seconds: float) -> bool:
         """Go on for some time; return whether the end is reached, and ``findings`` are known."""
@@ -349,7 +363,34 @@ def _named(
     findings = yield from _judged(settings, events, EARLY, known, len(longer) == len(events))
     if findings is None:
         findings = yield from _judged(settings, longer, LONGER * EARLY, known, is_all=True)
-    return findings or []
+    return findings or (yield from _mount(settings, events, known))
+
+
+def leaves_mount_open(settings: Settings) -> bool:
+    """Return whether a sensor that is turned against what is stated is not found as it drives."""
+    turned = axes_of(settings.two_d_mode).turned
+    return not np.array(settings.sensor_rotation_stddev)[turned].all()
+
+
+def _mount(
+    settings: Settings, recorded: Iterable[Event], known: Maps | None
+) -> Steps[list[Finding]]:
+    """Return how a sensor is turned against what is stated, by more than brackets are as a rule.
+
+    If points are likelier where that is estimated.
+    """
+    events = first_drive(recorded)
+    if not any(len(each.ids) for each in events if isinstance(each, ObservationEvent)):
+        return []
+    open_mount = Correction('', changes={'sensor_rotation_stddev': ROTATION})
+    turned = yield from _score(settings, events, open_mount, known)
+    findings = of_mounting(turned.calibration, 'mount_off', USUALLY_TURNED)
+    findings = [each for each in findings if each.kind == 'mount_off']  # no scale of ranges
+    if findings:
+        before = yield from _score(settings, events, AS_IT_IS, known)
+        count = min(turned.likelihood.count, before.likelihood.count)
+        findings = findings if count * (turned.mean - before.mean) > LIKELIER else []
+    return findings
 
 
 def _judged(
@@ -449,7 +490,9 @@ def _sized(
     by_wheels = replace(rough, changes={'linear_scale_stddev': (ROUGHLY, 0.0, 0.0)})
     judged = by_wheels if known is None else by_survey
     score = yield from _score(settings, events, judged, known)
-    factor = 1.0 / score.scale if known is None else score.range_scale
+    found_out = {each.name.partition('/')[0]: each.value for each in score.calibration}
+    by_range = found_out.get('range_scale', 1.0)
+    factor = 1.0 / found_out.get('linear_scale_x', 1.0) if known is None else by_range
     return replace(rough, points=factor * rough.points)
 
 
@@ -478,8 +521,7 @@ class _Score:
     likelihood: Likelihood
     per_unit: float
     turned_rad: float  # at most since the start, as it is seen
-    scale: float  # of the wheels
-    range_scale: float
+    calibration: Sequence[CalibrationEstimate]
     localised_share: float  # of the observations, in a loaded map
     is_hopeless: bool = False  # it was given up before its end
 
@@ -549,14 +591,12 @@ def _score(
 
     def so_far(is_hopeless: bool = False) -> _Score:
         R = np.array(attitudes)
-        found_out = {each.name.partition('/')[0]: each.value for each in estimator.calibration}
         return _Score(
             correction,
             recorder.likelihood,
             k * math.log(scale),
             float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
-            found_out.get('linear_scale_x', 1.0),
-            found_out.get('range_scale', 1.0),
+            estimator.calibration,
             sum(localised) / max(len(localised), 1),
             is_hopeless,
         )

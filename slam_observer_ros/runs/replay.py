@@ -83,11 +83,11 @@ def result_of(
         tally = notes if request.keeps_run else NisTally()
         needs_poses = request.keeps_poses or request.keeps_run or len(truth.stamps_ns) > 0
 
-        def look_for_mistakes() -> list[Finding]:
+        def look_for_mistakes(of_mount_only: bool = False) -> list[Finding]:
             """Read the recording again, and look whether a mistake of the set-up explains it."""
             with muted_warnings(), Recording(request.recording) as again:
                 events = again.events(selected, inputs, settings.velocity_timeout)
-                return mistakes(settings, events, maps or None)
+                return mistakes(settings, events, maps or None, of_mount_only)
 
         with estimate_writer(request, recording, selected, inputs, map_frame) as writer:
             recorders: list[Recorder] = [] if writer is None else [writer]

@@ -39,6 +39,7 @@ from slam_observer_ros.runs.health import (
     rule,
 )
 from slam_observer_ros.runs.metrics import TrajectoryErrors
+from slam_observer_ros.runs.mistakes import leaves_mount_open
 from slam_observer_ros.runs.result import list_dropped, MALFORMED, Replay, Result
 from slam_observer_ros.settings.node_settings import (
     InputSettings,
@@ -53,7 +54,7 @@ def judged(
     inputs: InputSettings,
     unused: Sequence[Finding],
     map_path: Path | None,
-    look_for_mistakes: Callable[[], Sequence[Finding]],
+    look_for_mistakes: Callable[[bool], Sequence[Finding]],
 ) -> list[Finding]:
     """Return what is wrong; ``unused`` is of inputs of which nothing was used."""
     run, selected = result.run, result.selected
@@ -67,8 +68,10 @@ def judged(
     if result.instants:
         findings += of_errors(result)
     reasons = [*findings, *of_all_learnt(run.estimator)]
-    if run.estimator.counts['slip'] or any(each.kind in SUSPICIOUS for each in reasons):
-        findings = [*look_for_mistakes(), *findings]
+    is_suspicious = any(each.kind in SUSPICIOUS for each in reasons)
+    of_mount_only = not run.estimator.counts['slip'] and not is_suspicious
+    if not of_mount_only or leaves_mount_open(run.estimator.settings):
+        findings = [*look_for_mistakes(of_mount_only), *findings]
     return sorted(explained(findings), key=lambda finding: -finding.level)
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.lie import se3
+from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.runs.mistakes import Correction, OPTICAL
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -34,6 +34,7 @@ MADE = {
     'turning_negated': Correction('', turn=-1.0),
     'driving_negated': Correction('', drive=-1.0),
     'no_turning': Correction('', turn=0.0),
+    'mount_off': Correction('', so3.exp(np.array([0.0, 0.0, math.radians(5.0)]))),
 }
 
 

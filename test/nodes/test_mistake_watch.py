@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -75,6 +76,28 @@ def test_it_looks_again_once_it_has_driven_for_as_long_again(monkeypatch):
         assert watched.timer.reset.called == looks
         if looks:
             searched(watched, node)
+
+
+def test_a_mount_that_shows_by_no_symptom_is_looked_at_after_a_minute_and_seldom_again(
+    monkeypatch,
+):
+    now_s = [0.0]
+    clock = SimpleNamespace(monotonic=lambda: now_s[0])
+    monkeypatch.setattr('slam_observer_ros.nodes.diagnostics.time', clock)
+    watched, node = watch(MADE['mount_off'].apply(drive(seconds=25.0)))
+    for now_s[0], looks in [(59.0, False), (61.0, True), (119.0, False), (122.0, True)]:
+        watched.timer.reset.reset_mock()
+        watched.look([], has_slipped=False)
+        assert watched.timer.reset.called == looks
+        if looks:
+            searched(watched, node)
+            assert [each.kind for each in watched.findings] == ['mount_off']
+    node.get_logger().error.assert_called_once_with(watched.findings[0].text())
+    watched._estimator.settings = replace(SETTINGS, sensor_rotation_stddev=(0.0, 0.0, 0.1))
+    now_s[0] = 1000.0
+    watched.timer.reset.reset_mock()
+    watched.look([], has_slipped=False)  # it is estimated as it drives
+    assert not watched.timer.reset.called
 
 
 def test_what_is_of_another_time_is_forgotten():

@@ -11,7 +11,7 @@ import pytest
 from slam_observer_ros.common.findings import explained, found
 from slam_observer_ros.events import ObservationEvent, RANGE, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.lie import so3
-from slam_observer_ros.runs.mistakes import _Score, AS_IT_IS, first_drive, mistakes
+from slam_observer_ros.runs.mistakes import _Score, AS_IT_IS, Correction, first_drive, mistakes
 from slam_observer_ros.runs.recorders import Likelihood
 
 
@@ -35,6 +35,16 @@ def test_where_all_is_right_nothing_is_named(factor, false):
         linear_velocity_noise=(0.02 * factor, 0.005 * factor, 0.0),
     )
     assert named(drive(seed=1, false=false), settings) == []
+
+
+@pytest.mark.parametrize(('turned_deg', 'kinds'), [(-5.0, ['mount_off']), (2.0, [])])
+def test_how_a_sensor_is_mounted_is_named_where_it_is_more_than_brackets_usually_are(
+    turned_deg, kinds
+):
+    R = so3.exp(np.array([0.0, 0.0, np.radians(turned_deg)]))
+    findings = mistakes(SETTINGS, Correction('', R).apply(drive()), of_mount_only=True)
+    assert [each.kind for each in findings] == kinds
+    assert all('further to the left' in each.what for each in findings)
 
 
 def test_who_goes_straight_on_does_not_turn_in_degrees():
