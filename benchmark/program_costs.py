@@ -18,7 +18,7 @@ from step_costs import drive, ESTIMATORS, make, settings_for
 import worlds
 
 TURNS = 5
-CONFIG = ['--config', 'wheeled_bearing_range']  # that of docs/gallery.md for its recording
+CONFIG = ['--config', 'mrclam']  # that of docs/gallery.md for its recording
 LONGEST_S = 300.0
 FEW, MANY, SEEN = 10, 1000, 10  # landmarks, for the memory of one
 LARGE_MAPS = (1000, 5000, 10_000)  # for the memory of all, with Riccati gains

@@ -166,9 +166,6 @@ def simulated_settings(config: str) -> Settings:
     return replace(
         shipped_settings(config),
         observation_correlation_time=0.0,
-        range_is_depth=False,
-        range_scale=1.0,
-        range_scale_stddev=0.0,
         sensor_rotation_stddev=(0.0, 0.0, 0.0),
     )
 
@@ -176,7 +173,7 @@ def simulated_settings(config: str) -> Settings:
 def mrclam(robot: int) -> World:
     """Return a robot's run of MRCLAM 6."""
     folder = data_folder() / 'mrclam' / 'MRCLAM_Dataset6'
-    return _recorded(load_mrclam(folder, robot), shipped_settings('wheeled_bearing_range'))
+    return _recorded(load_mrclam(folder, robot), shipped_settings('mrclam'))
 
 
 def starry_night() -> World:

@@ -33,7 +33,7 @@ from slam_observer_ros.settings.parameter_table import from_parameters
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 PICTURE = CHECKOUT / 'docs' / 'images' / 'robot.gif'
-CONFIG = CHECKOUT / 'config' / 'wheeled_bearing_range.yaml'
+CONFIG = CHECKOUT / 'config' / 'mrclam.yaml'
 ROBOT, DURATION_S, FRAME_S, TRAIL_FRAMES = 4, 360.0, 2.5, 30
 FRAMES_A_SECOND = 10
 SURVEY_SIGMA_M = 0.02

@@ -62,7 +62,7 @@ def main() -> None:
         replay(circle, 1.0, 'circle', '--gains', 'constant')
         if (folder := data / 'mrclam' / 'MRCLAM_Dataset6').is_dir():
             recording = convert(directory, 'mrclam6_4', 'mrclam', str(folder), '--robot', '4')
-            replay(recording, 320.0, 'mrclam6_4', '--config', 'wheeled_bearing_range')
+            replay(recording, 320.0, 'mrclam6_4', '--config', 'mrclam')
         if (file := data / 'starry_night' / 'dataset3.mat').is_file():
             recording = convert(directory, 'starry_night', 'starry-night', str(file))
             replay(recording, 162.0, 'starry_night', '--config', 'stereo_inertial')

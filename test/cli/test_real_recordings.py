@@ -24,7 +24,7 @@ def recordings(data_dir, tmp_path_factory):
         source = data_dir / 'mrclam' / 'MRCLAM_Dataset6'
         assert main(['convert', 'mrclam', str(source), '--robot', '4', str(robot)]) == 0
         assert 'left out: misread' in output.getvalue()
-    return {'stereo_inertial': starry_night, 'wheeled_bearing_range': robot}
+    return {'stereo_inertial': starry_night, 'mrclam': robot}
 
 
 def replayed(slam_observer, recordings, config, gains):
@@ -63,7 +63,7 @@ def test_starry_night(slam_observer, recordings, gains, ate_m, configuration_m):
 )
 def test_mrclam(slam_observer, recordings, gains, ate_m, configuration_m):
     """The tables have ATE of all of the path for the mean of five robots only."""
-    report = replayed(slam_observer, recordings, 'wheeled_bearing_range', gains)
+    report = replayed(slam_observer, recordings, 'mrclam', gains)
     assert report['landmarks'] == 15
     assert report['ate_rmse_m'] < 1.15 * ate_m
     assert report['configuration_rmse_m'] < 1.15 * configuration_m

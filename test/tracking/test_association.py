@@ -40,7 +40,7 @@ from slam_observer_ros.tracking.joint_compatibility import (
 )
 from slam_observer_ros.tracking.state import State
 
-CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'wheeled_bearing_range.yaml'
+CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'mrclam.yaml'
 
 
 def nameless(event):
