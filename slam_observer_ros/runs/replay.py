@@ -39,7 +39,7 @@ from slam_observer_ros.runs.metrics import (
     trajectory_errors,
     TrajectoryErrors,
 )
-from slam_observer_ros.runs.mistakes import mistakes
+from slam_observer_ros.runs.mistakes import leaves_mount_open, mistakes
 from slam_observer_ros.runs.recorders import DeadReckoning, NisTally, PoseSamples, RunRecorder
 from slam_observer_ros.runs.result import Accuracy, Replay, Request, Result, SmoothedRun
 from slam_observer_ros.runs.run_health import judged, of_use, unused_messages
@@ -85,6 +85,8 @@ def result_of(
 
         def look_for_mistakes(of_mount_only: bool = False) -> list[Finding]:
             """Read the recording again, and look whether a mistake of the set-up explains it."""
+            if of_mount_only and not leaves_mount_open(settings):
+                return []
             with muted_warnings(), Recording(request.recording) as again:
                 events = again.events(selected, inputs, settings.velocity_timeout)
                 return mistakes(settings, events, maps or None, of_mount_only)

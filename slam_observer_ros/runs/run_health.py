@@ -39,7 +39,6 @@ from slam_observer_ros.runs.health import (
     rule,
 )
 from slam_observer_ros.runs.metrics import TrajectoryErrors
-from slam_observer_ros.runs.mistakes import leaves_mount_open
 from slam_observer_ros.runs.result import list_dropped, MALFORMED, Replay, Result
 from slam_observer_ros.settings.node_settings import (
     InputSettings,
@@ -70,8 +69,7 @@ def judged(
     reasons = [*findings, *of_all_learnt(run.estimator)]
     is_suspicious = any(each.kind in SUSPICIOUS for each in reasons)
     of_mount_only = not run.estimator.counts['slip'] and not is_suspicious
-    if not of_mount_only or leaves_mount_open(run.estimator.settings):
-        findings = [*look_for_mistakes(of_mount_only), *findings]
+    findings = [*look_for_mistakes(of_mount_only), *findings]
     return sorted(explained(findings), key=lambda finding: -finding.level)
 
 
