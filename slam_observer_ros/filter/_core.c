@@ -4,11 +4,8 @@
  * the arrays of flat_arrays.py. UNUSUAL comes back before anything is changed, for a gap in the
  * velocities, landmarks that move, and where rounding has left no digits: Python goes on over the
  * same arrays. step.py says what the equations mean, and the units; a change is made in both, and
- * test/filter/test_core.py holds each step of either to the other.
- *
- * All that could be read or written beyond an array's end is checked when the arrays come in, in
- * the functions named read_...; nothing is checked after them. Nothing is kept from call to call.
- */
+ * test/filter/test_core.py holds each step of either to the other. Arrays are checked as they come
+ * in, by the functions named read_..., and nothing is after them or kept from call to call. */
 #include "_door.h" /* first, as it includes Python.h */
 #include "_se3.h"
 
@@ -532,9 +529,8 @@ static void spread(const FilterState *x, const double *noise, const double *F, d
     add_product(P, room, N, J, B, N, turns, 1.0);
     add_product(P, room, N, B, J, N, turns, 1.0);
     for (long s = turns; s < p; s++)
-        for (long j = 0; j < N; j++) {
+        for (long j = 0; j < N; j++)
             P[(j < s ? j : s) * room + (j < s ? s : j)] += B[s * N + j] * (j == s ? 2.0 : 1.0);
-        }
     mirror(P, room, N);
 }
 

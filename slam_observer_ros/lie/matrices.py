@@ -10,14 +10,12 @@ from scipy.linalg.lapack import dgesv, dposv, dpotrf, dpotri
 from slam_observer_ros.common.types import BoolArray, FloatArray
 
 _TINY = np.finfo(np.float64).tiny
-
 LARGE = 500  # equations whose solution takes longer than NumPy's overhead
 VERY_LARGE = 1500  # equations for which SciPy would keep other threads waiting
 
 # Standard deviation (m, rad, m/s, rad/s) beyond which a message only says 'unknown'. The largest
 # number there is, which drivers write for it, can't be turned without overflow.
 MAX_DEVIATION = 1e3
-
 LEAST_DEVIATION = 1e-4  # entries of smaller ones (m, rad, m/s, rad/s) are judged beside this one
 LEAST_SHARE = 1e-4  # of the largest one: what is below is lost in rounding where both turn
 COVARIANCE_ROUNDING = 1e-6  # by how much correlations may be off, or have a negative eigenvalue

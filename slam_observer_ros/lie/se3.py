@@ -202,7 +202,6 @@ def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -
 
 # Singular values (m²) below this part of the largest carry no direction, only rounding.
 _RANK_TOLERANCE = 1e-12
-
 _ROUNDING = 1e-14  # offsets from the mean below this part of the largest coordinate are rounding
 
 

@@ -22,7 +22,6 @@ _HAT = np.array(
 )
 _IDENTITY = np.eye(3)
 _THREE = 3.0 * _IDENTITY
-
 _ZERO_GUARD = 1e-300  # added to θ²: any angle above 1e-142 rad keeps all its bits
 ROUNDING = 1e-12  # how far RᵀR may be from identity after many products
 QUATERNION_NORM_TOLERANCE = 0.1  # how far from 1 the norm of a rotation's quaternion may be

@@ -31,16 +31,13 @@ HEADINGS = 24  # turns from which a solution is sought in the plane; in space as
 
 # Starts that are followed on after ``FIRST_STEPS``, and minima that are fitted with all noise.
 MOST_KEPT, MOST_FITTED = 32, 8
-
 FIRST_STEPS, STEPS, FITTING_STEPS = 5, 20, 10
-
 ONE = 0.03  # rad, and share of the map, within which two descents have ended at one minimum
 TRY_AGAIN, MOST_BETWEEN = 1.2, 10  # search again once views have grown by the factor or number
 
 # Share of the views that a pose explains, their χ² per view, and by how much more others have: the
 # odds are e^15 then.
 MOST, FITS, APART = 0.5, 2.5, 30.0
-
 SAME = 1.0  # standard deviations within which two minima are one, and a line has no sides
 
 # Largest standard deviations of the turn, rad, and of the place, as a share of the distances. With

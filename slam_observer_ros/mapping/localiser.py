@@ -36,9 +36,7 @@ logger = logging.getLogger(__name__)
 # Share of the observations that is new when the same landmarks are compared with a map again: with
 # many of them that takes long, and a single further observation seldom decides it.
 NEWS = 0.1
-
 CONFIRMING_VOTES = 10  # observations that confirm a pose that was given
-
 MAX_NAMED = 3
 
 # Standard deviations of a given pose, rad and m, beyond which points can't be matched by where
@@ -48,15 +46,12 @@ ROUGH_STD = np.repeat([0.5, 1.0], 3)
 # ln of how much likelier a point is where the robot is lost, if the map does not explain it, and
 # if it does: then 7 points in 10 are of nothing known, else 1 in 10.
 MISSING, EXPLAINED = 1.95, -1.1
-
 MAX_STEP = 3.0  # what an observation may say at most: its points have errors in common
 LIMIT = 8.0  # sum at which the robot is lost
 
 # Observations in a row, and for how long, that reject all that a fixed map has there. By then it
 # is no garbled message any more: behaviour trees ask within a second.
 CONTRADICTED_TIMES, CONTRADICTED_NS = 3, 500_000_000
-
-
 STRAYED_NS = 2_000_000_000  # a pose is doubted that landmarks contradict, too few to find it
 
 

@@ -27,7 +27,6 @@ MAX_CANDIDATES = 10  # landmarks that another one may be: the likeliest, if ther
 # Standard deviation of how far apart they may be though exactly known, metres: no two views of a
 # thing have quite the same centre.
 LEAST_M = 0.01
-
 NEIGHBOURS = 4  # landmarks next to one that say how many there are about it
 SHOULD_BE_SEEN = 3.0  # −ln of the probability below which it is no chance to miss a landmark
 

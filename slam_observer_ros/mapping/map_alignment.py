@@ -29,7 +29,6 @@ logger = logging.getLogger(__name__)
 # Standard deviation about any axis beyond which landmarks don't determine the attitude. Three of
 # them in a line leave the roll about it open; two that are close together, the heading.
 MAX_TURN_STD_RAD = 0.2
-
 CONTRADICTION_SIGMAS = 4.0  # landmarks whose misfit is as improbable as this contradict each other
 
 

@@ -70,17 +70,11 @@ logger = logging.getLogger(__name__)
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
-
 _MAX_INT64 = 2**63 - 1
-
 _ROUNDED_NORM = 1e-2  # by how much the norm of a quaternion written by hand may be off
-
 _COUNTED = ('id', 'position', 'sigma', 'covariance', 'orientation', 'orientation_sigma')
-
 _OPTIONAL = ('sigma', 'covariance', 'observations', 'orientation', 'orientation_sigma')
-
 _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
-
 MAX_BYTES = 70_000_000  # the largest file: two hundred thousand landmarks with covariances
 
 # Decimal numbers alone: by YAML 1.1, 010 is 8 and 1:30 is 90.

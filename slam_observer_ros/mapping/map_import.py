@@ -31,7 +31,6 @@ from slam_observer_ros.mapping.landmark_map import LandmarkMap, MAX_NUMBER
 logger = logging.getLogger(__name__)
 
 NO_ORIENTATION = np.zeros((3, 3))
-
 UNKNOWN_NOISE = np.diag(np.full(3, np.nan))
 
 
@@ -85,7 +84,6 @@ def facing(yaw_rad: float) -> FloatArray:
 
 
 MAX_BYTES = 20_000_000
-
 LAYOUTS = "TagSLAM's files, with 'bodies', or apriltag_ros's, with 'tag_bundles'"
 
 # The axes x, y, z that detectors give a tag, along those in the files; ``none`` for points.
@@ -101,7 +99,6 @@ LENGTHS = ('m', 'cm', 'mm')  # units of coordinates
 # Extent of a map, and distance of half of its landmarks to the nearest other, from which on both
 # its coordinates are hardly in metres: no sensor sees two of them at once.
 WIDE_M, SPARSE_M = 1000.0, 100.0
-
 MAX_NAMED = 12  # of what is left out, as many are named in one line
 
 
@@ -273,20 +270,14 @@ def _tagslam_row(
         noise = _tagslam_noise(tag['pose'], defaults)
         if noise is None:
             return Row(tag['id'], pose[:3, 3], pose[:3, :3], UNKNOWN_NOISE)
-        turn, shift = _in_axes(pose[:3, :3], noise)
+        R, position = pose[:3, :3], pose[:3, 3]
+        turn, shift = (R @ np.diag(part**2) @ R.T for part in (noise[:3], noise[3:]))
         if body_noise is not None:
-            body_turn, body_shift = _in_axes(in_map[:3, :3], body_noise)
-            arm = so3.hat(pose[:3, 3] - in_map[:3, 3])
-            turn, shift = turn + body_turn, shift + body_shift + arm @ body_turn @ arm.T
-        return Row(
-            tag['id'], pose[:3, 3], pose[:3, :3], shift, float(np.sqrt(np.trace(turn) / 3.0))
-        )
-
-
-def _in_axes(R: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return covariances (3, 3) of turn and shift from deviations (6,) along a pose's own axes."""
-    turn, shift = (R @ np.diag(part**2) @ R.T for part in (sigmas[:3], sigmas[3:]))
-    return turn, shift
+            B, arm = in_map[:3, :3], so3.hat(position - in_map[:3, 3])
+            of_body = [B @ np.diag(part**2) @ B.T for part in (body_noise[:3], body_noise[3:])]
+            turn = turn + of_body[0]
+            shift = shift + of_body[1] + arm @ of_body[0] @ arm.T
+        return Row(tag['id'], position, R, shift, float(np.sqrt(np.trace(turn) / 3.0)))
 
 
 def _tagslam_pose(written: Mapping[str, Any] | None) -> FloatArray:
@@ -307,9 +298,10 @@ def _tagslam_noise(written: Mapping[str, Any], defaults: Mapping[str, Any]) -> F
             sigmas.append(np.full(3, finite(defaults[name], name)))
     if len(sigmas) < 2:
         return None
-    if (np.concatenate(sigmas) < 0.0).any():
+    both = np.concatenate(sigmas)
+    if (both < 0.0).any():
         raise MapError('a noise is negative')
-    return np.concatenate(sigmas)
+    return both
 
 
 def _axes(written: Mapping[str, Any], name: str) -> FloatArray:
@@ -356,13 +348,9 @@ def _field_rows(content: Any) -> list[Row]:
 
 
 COLUMNS = ('id', 'x', 'y', 'z', 'sigma')  # without a header; z and sigma may be left out
-
 QUATERNION = ('qx', 'qy', 'qz', 'qw')
-
 SIGMAS = ('sigma_x', 'sigma_y', 'sigma_z')
-
 USED = (*COLUMNS, *SIGMAS, 'yaw', *QUATERNION, 'orientation_sigma')
-
 _KINDS = ('tag', 'marker', 'fiducial', 'landmark')
 
 OTHER_NAMES = {
@@ -371,18 +359,14 @@ OTHER_NAMES = {
 }
 
 IGNORED = ('size', 'tag_size', 'observations')  # columns of numbers that change no map
-
 UNITS = {'': 1.0, 'm': 1.0, 'rad': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'deg': np.pi / 180.0}
 UNITS['°'] = UNITS['deg']
-
 UNKNOWN_M = 10.0  # standard deviation of a height that a table does not have
 MAX_YAW_RAD = 6.3  # a larger one is taken to be in degrees
-
 _UNIT = re.compile(r'(.*?)\s*[\[(](.*)[\])]|(.+)_(m|mm|cm|rad|deg)')
 _COMMA_OF_DECIMALS = re.compile(r'[-+]?\d*,\d+(?:[eE][-+]?\d+)?')
 # What spaces separate; a comma inside is one of decimals.
 _WORDS = re.compile(r'(?:[^\s,]+|[-+]?\d*,\d+)(?:\s+(?:[^\s,]+|[-+]?\d*,\d+))+')
-
 _FIDUCIAL_SLAM = ('id', 'x', 'y', 'z', 'roll', 'pitch', 'yaw', 'variance', 'observations')
 
 

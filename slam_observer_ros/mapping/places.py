@@ -39,7 +39,6 @@ MAX_VARIANCE_FACTOR = 4.0  # variances may turn out larger than stated: real noi
 # Parameters of the beta distribution of f: one point in five is of no landmark, or none, or most
 # of them.
 FALSE, TRUE = 1.0, 4.0
-
 NOWHERE = 0.1  # probability beforehand that the robot is not in the map
 LEAST_VIEW_M = 1.0  # radius of what is in view at least, metres
 LEAST_STD = 1e-3  # standard deviation of a given pose at least, rad and m

@@ -14,10 +14,8 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 
 # One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it.
 Buffer: TypeAlias = bytes | bytearray | memoryview
-
 ENCAPSULATION_BYTES = 4
 MAX_PADDING_BYTES = 3
-
 _UINT16 = {'<': struct.Struct('<H'), '>': struct.Struct('>H')}
 _INT32 = {'<': struct.Struct('<i'), '>': struct.Struct('>i')}
 _UINT32 = {'<': struct.Struct('<I'), '>': struct.Struct('>I')}

@@ -34,7 +34,6 @@ COVARIANCE_NAMES = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
 VELOCITY_NAMES = ('vx', 'vy', 'vz')
 RANGE_NAME, RANGE_VARIANCE_NAME = 'range', 'range_variance'
 NO_RANGE_NAME = 'no_range'
-
 UNKNOWN_UINT32_ID = MAX_ID + 1  # how uint32 writes an unknown id: the same bits as -1
 FLOAT32_ID_LIMIT = 2**24  # from here on float32 can't distinguish neighbouring ids
 POINT_FIELD_UINT32, POINT_FIELD_FLOAT32 = 6, 7  # constants of sensor_msgs/PointField
@@ -102,17 +101,13 @@ def missing_ids(names: Sequence[str], message_type: str) -> str:
 
 # Types whose points may have no ids, or be true landmarks.
 CLOUDS = ('sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/PointCloud')
-
 MAX_UNKNOWN_POINTS = 500  # points without id in a message: associating costs their number cubed
-
 _OF_HALF_POINTS = (RANGE_NAME, RANGE_VARIANCE_NAME, NO_RANGE_NAME)
 _READ_NAMES = frozenset(
     (ID_NAME, *POINT_NAMES, *COVARIANCE_NAMES, *VELOCITY_NAMES, *_OF_HALF_POINTS)
 )
 _UPPER_TRIANGLE_TO_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]
-
 _NUMPY_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
-
 Records: TypeAlias = NDArray[np.void]  # (height, width), one record a point
 
 

@@ -27,7 +27,6 @@ DETECTIONS = 'vision_msgs/msg/Detection3DArray'
 BOXES = 'vision_msgs/msg/Detection2DArray'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 IN_IMAGES = (APRILTAGS, BOXES)  # types of pixels: directions by the camera's CameraInfo
-
 _POSE = 7
 _COVARIANCE = 36
 _SIZE = 3
@@ -35,7 +34,6 @@ _CENTRE_AND_CORNERS = 10
 _HOMOGRAPHY = 9
 _BOX = 5  # centre, rotation and size
 MAX_NAMES = 12  # names of frames that a log line lists
-
 _TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
 # A UUID, too. Names with a number, as ``facade12`` or ``b-000123``, have no letter after it.
 _HASH = re.compile(r'(?<![^\W_])(?=.*\d[a-f])[\da-f-]{8,}\Z', re.IGNORECASE)

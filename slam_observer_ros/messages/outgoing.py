@@ -193,7 +193,6 @@ def encode_point_cloud(stamp_ns: int, frame_id: str, ids: IntArray, points: Floa
 
 
 _INTEGERS = (ID_NAME, NO_RANGE_NAME)  # fields that are uint32; the others are float32
-
 _Columns: TypeAlias = dict[str, FloatArray | IntArray]
 
 
@@ -236,23 +235,18 @@ def _of_ranges(ids: IntArray, points: FloatArray, covariances: FloatArray | None
 
 
 PATH_SPACING_NS = 100_000_000  # least time between two poses of the path, nanoseconds
-
 POINT_SIZE_M = 0.2
 TEXT_HEIGHT_M = 0.3
 LINE_WIDTH_M = 0.03
 ARROW_LENGTH_M, ARROW_WIDTH_M = 1.0, 0.15
-
 GREEN = (0.0, 0.62, 0.45, 1.0)  # red, green, blue, opacity
 WHITE = (1.0, 1.0, 1.0, 1.0)
 PALE_GREEN = (0.0, 0.62, 0.45, 0.3)
 ORANGE = (0.84, 0.37, 0.0, 1.0)
 PINK = (0.8, 0.47, 0.65, 1.0)
-
 SKY = (0.34, 0.71, 0.91, 0.8)
-
 MAX_RINGS = 20  # of 36 lines each
 RING = np.linspace(0.0, 2.0 * np.pi, 37)
-
 MAX_LABELS = 200  # more could not be read, and each is a message of its own
 ELLIPSOID_SIGMAS = 3.0  # half axes, in standard deviations
 MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
@@ -468,7 +462,6 @@ class EstimateMessages:
 LITTLE_ENDIAN = bytes((0, 1, 0, 0))
 POSE_NUMBERS, TWIST_NUMBERS, COVARIANCE_NUMBERS = 7, 6, 36
 UNCERTAIN_NUMBERS = POSE_NUMBERS + COVARIANCE_NUMBERS
-
 _STAMP = struct.Struct('<iI')
 _LINEAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
 _UNKNOWN = np.array([-1.0] + [0.0] * 35)

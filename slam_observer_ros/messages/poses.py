@@ -22,9 +22,7 @@ from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.registry import Decoder, reads
 
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'  # poses of sensors, and landmarks if they are fiducials
-
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
-
 _NEARLY = 1.0 - 1e-9  # of a limit: what is below that is below the limit, however it is rounded
 
 

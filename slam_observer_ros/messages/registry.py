@@ -26,7 +26,6 @@ MessageT_co = TypeVar('MessageT_co', covariant=True)
 
 # From a serialised message and its receive time, which only unstamped messages use.
 Decode: TypeAlias = Callable[[Buffer, int], MessageT]
-
 _COMPARED = 4  # messages of the first block that are read one by one as well
 
 

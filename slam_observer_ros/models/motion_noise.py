@@ -41,14 +41,12 @@ MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
 # Standard deviations of a motion in one gap, rad and m: it is as unknown as it can be. More would
 # only drown all else that is known in rounding.
 MAX_GAP_ERRORS = np.repeat([np.pi, 1000.0], 3)
-
 SPEED_WINDOW_S = 1.0  # a velocity is averaged over it, as its error may be in proportion to it
 MEMORY = 300  # observations over which the factors are found: they follow a change of the ground
 MAX_STEP = 0.5  # change of ln ρ by one observation, at most
 
 # Of ρ: a tenth to thirty times the standard deviation that is stated.
 LEAST_LOGARITHM, LARGEST_LOGARITHM = math.log(1e-2), math.log(1e3)
-
 RARE = 2.33  # standard deviations beyond which one in a hundred is
 
 # Least ln ρ that is applied, by ``motion_noise_factor``; 'stated' applies none.
@@ -56,9 +54,7 @@ LEAST = {'stated': math.inf, 'at_least_stated': 0.0, 'auto': -math.inf}
 
 # The motions that have a factor, and how the names of their noise begin.
 KINDS = {'turning': 'angular', 'driving': 'linear'}
-
 _IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
-
 PRIOR_DEVIATION = 0.5  # of ln of a factor of the standard deviation at the start: half as for θ
 
 

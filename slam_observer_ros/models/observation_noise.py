@@ -25,7 +25,6 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 RESOLUTION_RAD = 1e-4  # least standard deviation of an orientation about each axis
 LASTING = 0.1  # share of the time a robot has stood for which its sensor's error is taken to last
-
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 

@@ -12,16 +12,13 @@ from slam_observer_ros.lie.matrices import limited
 # Standard deviation that each coordinate of an observed point has at least. A smaller one is lost
 # in rounding beside a pose that may be off by a kilometre.
 RESOLUTION_M = 1e-4
-
 RELATIVE_RESOLUTION = 1e-6  # the same as a share of the distance, for single precision or better
 MAX_ERROR_M = 1e3  # standard deviation of a point beyond which a message only says 'unknown'
 
 # Least variance of an observed point in any direction, as a share of its total variance. But no
 # more than (1 mm)², as of a bearing whose depth may be anywhere within a kilometre.
 MIN_SHARE, MOST_SHARE_M2 = 1e-6, 1e-6
-
 MIN_INTERVAL_S = 1e-3  # observations that are less apart count so: two cameras may see at once
-
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 

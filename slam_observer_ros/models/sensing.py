@@ -23,7 +23,6 @@ from slam_observer_ros.models.calibration import Calibration, EACH
 from slam_observer_ros.settings.estimator_settings import Settings
 
 LEAST_COSINE = 0.2  # cosine of the angle off its axis, 78°, beyond which no sensor sees depth
-
 _ALONG_X = np.array([1.0, 0.0, 0.0])
 _TINY = np.finfo(np.float64).tiny
 
@@ -125,7 +124,6 @@ MOST_UNCOMPARED = 64  # observations whose ranges are compared at once
 
 # Least number of points that says something, and the parts of them that scatter.
 MIN_POINTS, PARTS = 200, 20
-
 MIN_SPREAD = 0.02  # least standard deviation of ln cos b: half a field of view of some 25°
 MAX_BEHIND = 0.1  # share of the points beside or behind the sensor beyond which it sees all around
 MAX_ERROR = 1.0  # error of ln range beyond which a point is no measurement of its landmark

@@ -28,8 +28,6 @@ from slam_observer_ros.models.calibration import Calibration
 from slam_observer_ros.models.velocity_history import VelocityHistory
 
 _PER_MEDIAN = 1.4826  # standard deviation over the median absolute value, of normal ones
-
-
 SAMPLED = 3  # one of so many motions is looked at: only ratios of sums count, and time
 
 

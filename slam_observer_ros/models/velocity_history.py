@@ -26,7 +26,6 @@ NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND  # before time began
 # The last 16 times 64 periods show how long messages of a sensor are in force as a rule. So many
 # that they have pauses in them where these are usual, as of commands.
 BLOCK, BLOCKS = 64, 16
-
 FEWEST_PERIODS = 5  # periods that show how often messages come: a pause or two change nothing
 
 # How long a velocity must have been exactly zero before the robot stands, nanoseconds. Commands
@@ -45,7 +44,6 @@ INSTABILITY = 1e-4
 # eight hours, with twenty messages a second, it drifts by 4 mm. With much less, what links two
 # observations would weigh so much that smoothing had no digits left for what is seen.
 STANDING = 1e-4**2 * np.eye(6)
-
 FIRST_CAPACITY = 64  # velocities that there is room for at first
 
 

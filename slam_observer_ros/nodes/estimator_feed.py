@@ -43,7 +43,6 @@ AROUND_S = 0.5  # how much later than /clock messages of the run before may come
 # How often a node looks whether /clock has jumped, every 20 ms, before it uses what it holds. Not
 # a time: a node that was held up itself has not seen yet what has come meanwhile.
 MAX_LOOKS = 25
-
 MAX_HELD = 10_000  # messages that may wait for /clock to jump
 
 

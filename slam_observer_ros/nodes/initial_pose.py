@@ -157,7 +157,6 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
 # Age up to which a kept pose is used: a respawn, an update or new batteries take less, and who
 # stood for longer may have been pushed.
 MAX_AGE_S = 600.0
-
 FAST_M_PER_S = 3.0  # no robot indoors drives faster: its odometry then is another
 AT_START_M, AT_START_RAD = 0.1, 0.1  # how far from its origin an odometry is that has just begun
 

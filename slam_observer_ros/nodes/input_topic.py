@@ -32,13 +32,10 @@ from slam_observer_ros.runs.health import Backlog, of_publishers, of_types, over
 # How long a topic may be without publisher or message before that is logged. Where an announcement
 # was lost, as on a busy machine, DDS repeats it after 3 s only.
 DISCOVERY_S = 5.0
-
 WELL_S = 1.0  # how long a topic on which messages come is not looked at again
 HELD_UP_S = 1.0  # without a look at the topics, due four times a second, a node was held up
 MAX_FULL_NAMES = 3  # of message types in a log line
-
 Decoder: TypeAlias = Callable[[Buffer, int], Any]
-
 TRY_S = 2.0  # how long a type that has not come yet is waited for while others are published
 KEEP_S = 5.0  # how long a type that has come before must be silent until another one is tried
 

@@ -85,7 +85,6 @@ ARGUMENTS = {
 }
 
 EXECUTABLE, NAME = 'lifecycle_observer_node', 'observer_node'
-
 BOND_PERIOD_S = 0.25
 
 

@@ -51,7 +51,6 @@ from slam_observer_ros.settings.node_settings import ManagedNodeSettings, Observ
 from slam_observer_ros.settings.parameter_table import changed_names, Dataclass, table
 
 RETRY_PERIOD_S = 0.02
-
 MOTION_INPUTS = ('twist', 'imu')  # they are cheap to use, and move the estimate on to the present
 
 
@@ -179,7 +178,6 @@ OVERVIEW_PERIOD_S = 0.5
 DIAGNOSTICS_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
 KEEP_PERIOD_S = 2.0
-
 CLOCK_JITTER_NS = 100_000_000  # a /clock that steps back by less has not jumped: messages are late
 
 

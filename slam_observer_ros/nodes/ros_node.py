@@ -298,8 +298,6 @@ def install_command(package: str) -> str:
 
 # Makes what the nodes publish.
 MESSAGES = OutgoingMessages(message_class, lambda data: array('B', data))
-
-
 RELIABLE_QOS = QoSProfile(depth=10)  # out: any subscriber fits a reliable publisher
 
 # Out: as AMCL's pose; a late subscriber gets the last ones, as many as it keeps itself.

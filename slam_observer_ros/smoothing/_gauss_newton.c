@@ -4,12 +4,8 @@
  * points do. eliminate() takes all poses but the border out of them, and fill_in() finds the
  * changes of the poses from that of the border. What the equations mean, and the units, those two
  * modules say; a change is made in both, and test/smoothing/test_compiled.py holds each to the
- * other.
- *
- * All that could be read or written beyond an array's end is checked when the arrays come in, in
- * the functions named read_...; nothing is checked after them. Nothing is kept from call to call.
- * Other threads run meanwhile: the equations are those of the caller alone.
- */
+ * other. Arrays are checked as they come in, by the functions named read_..., and nothing is after
+ * them. Other threads run meanwhile: the equations are those of the caller alone. */
 #include "../filter/_door.h" /* first, as it includes Python.h */
 #include "../filter/_se3.h"
 

@@ -27,9 +27,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.lie.matrices import inverse_by_factor, transpose
 
 COMPILED = compiled('smoothing._gauss_newton')
-
 STRIDE = 8
-
 SMALL_BORDER = 100  # less to carry along the whole chain than a detour costs
 
 

@@ -51,15 +51,11 @@ logger = logging.getLogger(__name__)
 # A large map takes many observations. So many share the cost, O(n³) for n landmarks, that each of
 # them costs no more than an update, O(n²).
 SHARE_OF_HISTORY = 0.1
-
 MAX_INTERVAL = 300  # observations that are enough, however many there were before
 MOST_AWAITED = 1000  # keyframes kept for landmarks that may enter: they cost some milliseconds
 MAX_UNKNOWNS = 600  # of a map that is relinearised, in some tenths of a second: 100 tags in space
-
 NO_HISTORY = "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
-
 CUT = 'the history was cut (smoothing_window=0 keeps all of it)'
-
 MAX_TURN_RAD = 0.2  # angle, see :meth:`.Prior.least_nonlinear`, beyond which there is no summary
 
 # Share of the observations otherwise waited for that will do after a single large correction:
@@ -68,7 +64,6 @@ EARLY_SHARE = 0.1
 
 # Steps at most; change of pose and map, rad and m, below which one will do.
 ITERATIONS, TOLERANCE = 2, 2e-2
-
 ENTRY_ITERATIONS = 10  # at most where a landmark enters, which corrects all since it was seen
 PLACING_ITERATIONS, COST_TOLERANCE = 40, 0.1  # steps to place a landmark; least gain of one
 SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6  # the same for smoothing everything
