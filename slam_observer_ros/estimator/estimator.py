@@ -405,15 +405,17 @@ class Estimator(Estimate):
 
         Return whether that may have moved the robot.
         """
-        if self._localiser.is_localised:
-            self._warnings.two_places.note(self._hypotheses.best, event, update)
+        two_places = self._warnings.two_places
+        is_news = two_places.sighted or np.count_nonzero(update.rejected)
+        if is_news and self._localiser.is_localised:
+            two_places.note(self._hypotheses.best, event, update)
         if self._localiser.maps:
             was_localised = self._localiser.is_localised
             self._placement.localise(event, update, self._half_points.window)
             if self._localiser.is_localised != was_localised:
                 self._half_points.clear()
                 # It is in the same map again later, unless there are several.
-                self._warnings.two_places.doubt(is_all=len(self._localiser.maps) > 1)
+                two_places.doubt(is_all=len(self._localiser.maps) > 1)
             elif (
                 was_localised
                 and (loaded := self._localiser.loaded) is not None

@@ -138,27 +138,25 @@ class TwoPlaces:
     """
 
     def __init__(self) -> None:
-        self._sighted: dict[int, _Sighted] = {}
+        self.sighted: dict[int, _Sighted] = {}
         self.findings: dict[int, Finding] = {}  # by id
 
     def doubt(self, *, is_all: bool) -> None:
         """Forget where landmarks seem to be as the pose was wrong; or all places, if it may be."""
-        kept = {} if is_all else self._sighted
-        self._sighted = {i: _Sighted(each.places) for i, each in kept.items()}
+        kept = {} if is_all else self.sighted
+        self.sighted = {i: _Sighted(each.places) for i, each in kept.items()}
 
     def note(self, state: State, event: ObservationEvent, update: Update) -> None:
-        """Take what an observation has shown."""
-        if not self._sighted and not np.count_nonzero(update.rejected):
-            return
+        """Take what an observation has shown, where points were rejected or some are sighted."""
         rejected = dict(zip(update.ids.tolist(), update.rejected.tolist(), strict=True))
-        self._confirm({i: is_off for i, is_off in rejected.items() if i not in self._sighted})
+        self._confirm({i: is_off for i, is_off in rejected.items() if i not in self.sighted})
         at = {i: k for k, i in enumerate(event.ids.tolist()) if i in rejected}
         points = se3.transform(update.pose, event.points)
         if len(rejected) > 1 and is_contradiction(update.rejected):
             return
         self._begin(state, update, {i: points[k] for i, k in at.items()})
         variances = np.trace(state.observation_noise.covariances(event), axis1=1, axis2=2)
-        for i in self._sighted.keys() & at.keys():
+        for i in self.sighted.keys() & at.keys():
             tolerance_m = SAME_POSITION * math.sqrt(variances[at[i]])
             often = state.settings.max_rejections
             seen = points[at[i]], event.sensor_frame
@@ -167,7 +165,7 @@ class TwoPlaces:
     def _confirm(self, are_off: Mapping[int, bool]) -> None:
         """Decide by other landmarks, that are rejected or not, whether the pose was right."""
         votes = len(are_off) - 2 * sum(are_off.values())
-        for i, sighted in list(self._sighted.items()):
+        for i, sighted in list(self.sighted.items()):
             if sighted.pending is None or not votes:
                 continue
             if votes > 0:
@@ -175,7 +173,7 @@ class TwoPlaces:
                 continue
             sighted.against.update(other for other, is_off in are_off.items() if is_off)
             if len(sighted.against) > 1:  # a single one may be there twice, too
-                del self._sighted[i]
+                del self.sighted[i]
 
     def _begin(self, state: State, update: Update, points: Mapping[int, FloatArray]) -> None:
         """Follow landmarks that are rejected for the first time, if they were known well."""
@@ -184,8 +182,8 @@ class TwoPlaces:
             i, row = int(update.ids[k]), rows[k]
             is_known = landmarks.counts[row] >= state.settings.confirmations
             is_known |= landmarks.born_ns[row] < 0  # in a map that was loaded
-            if is_known and i in points and i not in self._sighted:
-                self._sighted[i] = _Sighted([points[i] - update.residuals[k]])
+            if is_known and i in points and i not in self.sighted:
+                self.sighted[i] = _Sighted([points[i] - update.residuals[k]])
 
     def _follow(
         self,
@@ -197,12 +195,12 @@ class TwoPlaces:
         often: int,
     ) -> None:
         """Take one more point (3,) of a landmark, world, metres."""
-        sighted = self._sighted[landmark_id]
+        sighted = self.sighted[landmark_id]
         places = sighted.places
         if not is_rejected and len(places) == 1 and sighted.pending is None:
             sighted.runs.pop(sensor, None)
             if not sighted.runs:  # but an outlier
-                del self._sighted[landmark_id]
+                del self.sighted[landmark_id]
             return
         pending = sighted.pending
         if pending is not None and not is_rejected:
@@ -224,7 +222,7 @@ class TwoPlaces:
 
     def _add(self, landmark_id: int, place: FloatArray) -> None:
         """Note that a landmark is at a place; it is found if it has been there before."""
-        sighted = self._sighted[landmark_id]
+        sighted = self.sighted[landmark_id]
         sighted.pending, sighted.against, last = None, set(), sighted.places[-1]
         near_m = RETURNED * float(np.linalg.norm(place - last))
         before = sighted.places[:-1]

@@ -25,7 +25,7 @@ from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.models.calibration import Calibration
-from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.models.held_velocities import Velocities
 
 _PER_MEDIAN = 1.4826  # standard deviation over the median absolute value, of normal ones
 SAMPLED = 3  # one of so many motions is looked at: only ratios of sums count, and time
@@ -41,7 +41,7 @@ class DelayEvidence:
 
     def add(
         self,
-        velocities: VelocityHistory,
+        velocities: Velocities,
         calibration: Calibration,
         variances: FloatArray,
         start_ns: int,
@@ -57,7 +57,10 @@ class DelayEvidence:
         delay_ns, reach_ns = calibration.delay_ns, calibration.delay_error_ns
         duration_s = (end_ns - start_ns) / NANOSECONDS_PER_SECOND
         centres_ns = start_ns - delay_ns, end_ns - delay_ns
-        stamps, V = velocities.between(centres_ns[0] - reach_ns, end_ns)
+        bounds_ns = centres_ns[0] - reach_ns, end_ns
+        first, end = velocities.stamps_ns.searchsorted(bounds_ns, 'right').tolist()
+        in_force = slice(max(first - 1, 1), end)
+        stamps, V = velocities.stamps_ns[in_force], velocities.body_velocities[in_force]
         if len(stamps) < 2 or stamps[0] == stamps[-1] or duration_s <= 0.0:
             return
         axes = calibration.axes.pose

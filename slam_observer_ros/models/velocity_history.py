@@ -209,13 +209,6 @@ class VelocityHistory:
         found = held(self.flat(), start_ns, end_ns)
         return replace(found, body_velocities=self._counting(found.body_velocities))
 
-    def between(self, start_ns: int, end_ns: int) -> tuple[IntArray, FloatArray]:
-        """Return stamps and measured velocities (m, 6) of those in force between two stamps."""
-        stamps_ns = self._joined.stamps_ns[: self._count]
-        first, end = stamps_ns.searchsorted((start_ns, end_ns), 'right').tolist()
-        rows = slice(max(first - 1, 1), end)
-        return self._joined.stamps_ns[rows], self._joined.body_velocities[rows]
-
     def flat(self) -> Velocities:
         """Return all that are known as plain arrays."""
         linear_s = self._periods.usual_s

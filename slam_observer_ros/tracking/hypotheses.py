@@ -284,7 +284,7 @@ class Hypotheses:
             )
             calibration = state.calibration
             if calibration.delay_error_ns:
-                self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
+                self._delay_evidence.add(flat, calibration, variances, start_ns, end_ns)
         self._velocities = velocities
 
     @property

@@ -10,7 +10,6 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Change, NormalisedInnovation, Reason, Update
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.filter.arrays import SeenOrientations
 from slam_observer_ros.filter.flat_arrays import Limits, Seen
 from slam_observer_ros.filter.observer import lyapunov
 from slam_observer_ros.filter.robust import accepted
@@ -137,15 +136,38 @@ def append(one: Association) -> None:
     if state.is_mapping and np.count_nonzero(table.rejections[one.at]):
         one.in_doubt = table.in_doubt(one.at, settings.max_rejections)
         some_in_doubt = bool(np.count_nonzero(one.in_doubt))
-    if state.relinearisation.is_active and len(one.at):
-        has_turns = one.event.orientations is not None
-        turns = seen_orientations(state, one.in_map, one.at) if has_turns else None
-        kept, stands = keyframe(one, turns), state.observation_noise.stood_s > 0.0
-        # A robot that is parked says nothing more, in place of the drive's observations.
-        if stands and not some_in_doubt and kept.repeated.min(initial=np.inf) > OLD_NEWS:
-            state.counts['parked_observation'] += 1
-        else:
-            state.relinearisation.add(kept, some_in_doubt)
+    if not (state.relinearisation.is_active and len(one.at)):
+        return
+    event, seen, out, rows = one.event, one.seen, one.out, one.rows
+    sensed, covariances = event.sensed, out.covariances if len(out.covariances) else None
+    if seen.sensor is not None:
+        number = state.calibration.sensors.index(event.sensor_frame)
+        origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
+        numbers, none = np.full(len(rows), number), np.full(len(rows), -1)
+        sensed = Sensed(numbers, origins, seen.arms, none, event.orientations)
+    if covariances is not None and seen.directions is not None:
+        covariances = covariances + unmeasured_covariances(seen.directions)
+    has_turns = event.orientations is not None
+    keyframe = Keyframe(
+        event.stamp_ns,
+        rows,
+        out.points,
+        out.lines_of_sight,
+        covariances,
+        out.repeated,
+        seen_orientations(state, one.in_map, one.at) if has_turns else None,
+        sensed,
+        event.kinds,
+        None if event.sensor is None and seen.sensor is None else out.origins,
+    )
+    if len(one.at) < len(rows):
+        keyframe = keyframe.select(rows >= 0)
+    stands = state.observation_noise.stood_s > 0.0
+    # A robot that is parked says nothing more, in place of the drive's observations.
+    if stands and not some_in_doubt and keyframe.repeated.min(initial=np.inf) > OLD_NEWS:
+        state.counts['parked_observation'] += 1
+    else:
+        state.relinearisation.add(keyframe, some_in_doubt)
 
 
 def follow_moved(one: Association) -> Update:
@@ -280,37 +302,6 @@ def _seen(state: State, event: ObservationEvent, rows: IntArray) -> Seen:
         column,
         None if D is None else _PLAIN(D),
     )
-
-
-def keyframe(one: Association, turns: SeenOrientations | None) -> Keyframe:
-    """Return the points as they are kept to be linearised again, of landmarks ``rows`` by now.
-
-    Without those whose landmark is not in the map, −1. ``turns`` are of the others.
-    """
-    event, seen, out, rows = one.event, one.seen, one.out, one.rows
-    sensed = event.sensed
-    if seen.sensor is not None:
-        number = one.state.calibration.sensors.index(event.sensor_frame)
-        origins = np.zeros_like(seen.arms) if seen.origins is None else seen.origins
-        numbers, none = np.full(len(rows), number), np.full(len(rows), -1)
-        sensed = Sensed(numbers, origins, seen.arms, none, event.orientations)
-    covariances = out.covariances if len(out.covariances) else None
-    if covariances is not None and seen.directions is not None:
-        covariances = covariances + unmeasured_covariances(seen.directions)
-    every = Keyframe(
-        event.stamp_ns,
-        rows,
-        out.points,
-        out.lines_of_sight,
-        covariances,
-        out.repeated,
-        turns,
-        sensed,
-        event.kinds,
-        None if event.sensor is None and seen.sensor is None else out.origins,
-    )
-    kept = rows >= 0
-    return every if np.count_nonzero(kept) == len(rows) else every.select(kept)
 
 
 def innovation_of(one: Association) -> NormalisedInnovation:

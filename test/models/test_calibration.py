@@ -262,7 +262,7 @@ def test_what_a_command_by_key_press_changes_is_no_noise_that_passes_for_a_delay
     for start_ns in range(0, 20 * 10**9, 10**8):
         while pressed and pressed[0].stamp_ns <= start_ns:
             history.append(pressed.pop(0))
-        evidence.add(history, calibration, np.full(6, 1e-4), start_ns, start_ns + 10**8)
+        evidence.add(history.flat(), calibration, np.full(6, 1e-4), start_ns, start_ns + 10**8)
     found = CalibrationEstimate('velocity_delay', 0.46, 0.02, 's', stated=0.2)
     assert evidence.corrected(found, 0.2).value == pytest.approx(0.46, abs=0.05)
 

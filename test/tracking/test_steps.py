@@ -163,8 +163,9 @@ def ask_for_poses(estimator):
     """Ask for the pose now, and sometimes for those at all stamps since the last observation."""
     assert estimator.pose_covariance.shape == (6, 6)
     velocities, state_ns = estimator._timeline.velocities, estimator._timeline.state_ns
-    stamps_ns = velocities.between(state_ns, estimator.stamp_ns)[0]
-    stamps_ns = np.unique(stamps_ns[stamps_ns > state_ns])
+    stamps_ns = velocities.flat().stamps_ns
+    is_since = (stamps_ns > state_ns) & (stamps_ns <= estimator.stamp_ns)
+    stamps_ns = np.unique(stamps_ns[is_since])
     if len(stamps_ns) % 16 == 3:
         poses, covariances = estimator._hypotheses.poses_until(
             velocities, state_ns, stamps_ns, with_covariances=True
