@@ -34,10 +34,7 @@ def symmetric(P: FloatArray) -> FloatArray:
 
 
 def solve(S: FloatArray, right: FloatArray) -> FloatArray:
-    """Return S⁻¹ b for S (q, q) and b (q, …), as `numpy.linalg.solve` does at twice the cost.
-
-    A singular S raises LinAlgError.
-    """
+    """Return S⁻¹ b for S (q, q), b (q, …), at half of numpy's cost; LinAlgError if singular."""
     if not right.size:  # which SciPy does not take
         return right
     if len(S) > LARGE:  # with SciPy no other thread would get a word in for seconds
@@ -205,10 +202,7 @@ def turned(joint: FloatArray, R: FloatArray) -> FloatArray:
 
 
 def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
-    """Return covariances (…, d, d) without variances that would drown all others in rounding.
-
-    Standard deviations are at most ``largest`` (d,); the correlations stay.
-    """
+    """Return covariances (…, d, d) of deviations up to ``largest`` (d,), as correlated."""
     # Rounding may have left a variance a hair below zero.
     deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
     scales = largest / np.maximum(deviations, largest)
@@ -216,10 +210,7 @@ def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
 
 
 def are_covariances(matrices: FloatArray) -> BoolArray:
-    """Return which matrices (…, d, d) are symmetric, and negative in no direction.
-
-    Each entry is judged in its own standard deviations: a large variance hides no wrong one.
-    """
+    """Return which (…, d, d) are symmetric and nowhere negative, in their own deviations."""
     # Nearly all have a Cholesky factor, but for exact entries: that costs a fifth.
     exact, rooted = matrices.diagonal(axis1=-2, axis2=-1) == 0.0, matrices
     is_other = False

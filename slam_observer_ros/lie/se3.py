@@ -190,10 +190,7 @@ def at_poses(pieces: FloatArray) -> FloatArray:
 
 
 def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -> FloatArray:
-    """Return poses at a ``share`` (…), 0 to 1, of the way between two, as tf2 has them.
-
-    Positions are in a line, rotations about one axis.
-    """
+    """Return poses at a ``share`` (…) of the way between two: in a line, and about one axis."""
     R, share = start[..., :3, :3], np.asarray(share)[..., None]
     turn = so3.log(R.swapaxes(-1, -2) @ end[..., :3, :3])
     shift = end[..., :3, 3] - start[..., :3, 3]

@@ -78,10 +78,7 @@ def log(R: FloatArray) -> FloatArray:
 
 
 def left_jacobian(phi: FloatArray) -> FloatArray:
-    """Return J = ∫₀¹ exp(s φ) ds = I + b K + c K².
-
-    exp(φ + δ) = exp(J δ) exp(φ) to first order in δ.
-    """
+    """Return J = ∫₀¹ exp(s φ) ds = I + b K + c K²; exp(φ + δ) ≈ exp(J δ) exp(φ)."""
     K = hat(phi)
     theta_squared, a, b = coefficients(phi)
     # 1 − a cancels near zero, but K² = O(θ²) takes the error back to rounding.

@@ -147,10 +147,7 @@ def _counts(known: LandmarkMap, state: State) -> IntArray:
 
 
 def _renumber(state: State, known: LandmarkMap, rows: IntArray, known_ids: IntArray) -> None:
-    """Give ``rows`` the ids that a map has for them.
-
-    Others get new numbers where the map's have the same, though no sensor gave these.
-    """
+    """Give ``rows`` a map's ids, and new numbers to others that no sensor named like these."""
     ids = state.landmarks.ids
     own = np.flatnonzero(is_automatic(ids) & np.isin(ids, known.ids))
     taken = np.append(ids[is_automatic(ids)], known.ids[is_automatic(known.ids)])
@@ -207,10 +204,7 @@ def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
 def _with_covariances(
     landmark_map: LandmarkMap, state: State, rows: IntArray, is_own_frame: bool
 ) -> LandmarkMap:
-    """Return the map of landmarks ``rows`` with what is known of its errors.
-
-    That is, unless there are too many, the joint covariance, too.
-    """
+    """Return the map of landmarks ``rows`` with its errors, all together unless too many."""
     n, tags, sigmas = len(rows), landmark_map.tags, np.zeros(len(rows))
     if n > MAX_CORRELATED and not is_own_frame:  # of those a map of any size could be loaded
         joint, of_all = None, state.landmark_covariances()

@@ -130,10 +130,7 @@ class Places:
 
 
 class Anywhere:
-    """Nothing is known beforehand but that a constellation is somewhere in the map.
-
-    ``largest`` is ln of the largest density, over rad and m.
-    """
+    """A constellation is somewhere in the map; ``largest`` is ln of its density, rad and m."""
 
     def __init__(self, known: MappedLandmarks) -> None:
         axes = known.axes

@@ -232,10 +232,7 @@ def _read_result(reader: CdrReader, has_numbers: bool) -> tuple[str, FloatArray]
     ),
 )
 def decode_boxes(reader: CdrReader) -> ObservationEvent:
-    """Read a vision_msgs/Detection2DArray: in which directions the centres of boxes are.
-
-    Ids are as in a Detection3DArray.
-    """
+    """Read a vision_msgs/Detection2DArray: directions of boxes, ids as in a Detection3DArray."""
     stamp_ns, frame_id = reader.header()
     boxes = []
     for _ in range(reader.uint32()):
@@ -290,10 +287,7 @@ _MATRICES = (9, 9, 12)  # K, R and P
 
 
 def decode_camera_info(raw: Buffer) -> tuple[str, Camera]:
-    """Read a sensor_msgs/CameraInfo: its frame, and the camera.
-
-    Raise a MessageError if the camera is not calibrated.
-    """
+    """Read a sensor_msgs/CameraInfo's frame and camera; MessageError if it isn't calibrated."""
     reader = CdrReader(raw)
     _, frame_id = reader.header()
     reader.uint32(), reader.uint32()  # height and width

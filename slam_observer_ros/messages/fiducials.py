@@ -270,10 +270,7 @@ def _along_and_across(measured: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _polar_covariances(
     ranges: FloatArray, axes: FloatArray, deviations: FloatArray
 ) -> FloatArray | None:
-    """Return covariances (m, 3, 3) of range, yaw and pitch's deviations; None if unknown.
-
-    A pitch of none, as of a sensor in the plane, is taken to be as uncertain as the yaw.
-    """
+    """Return covariances (m, 3, 3) of range, yaw and pitch (0: as the yaw); None if unknown."""
     of_range, of_yaw, of_pitch = deviations
     if not (np.isfinite(deviations).all() and of_range > 0.0 and of_yaw > 0.0):
         return None

@@ -494,10 +494,7 @@ class StateMessages:
 
 
 def uncertain_pose(pose: FloatArray, covariance: FloatArray | None) -> FloatArray:
-    """Return the (43,) numbers of a geometry_msgs/PoseWithCovariance; covariance None if unknown.
-
-    It is along the map's axes, rad² and m².
-    """
+    """Return a PoseWithCovariance's (43,) numbers; its covariance along map axes, or None."""
     return np.concatenate((*_position_and_quaternion(pose), _covariance(covariance)))
 
 

@@ -81,10 +81,7 @@ class PoseBlock:
 def decode_poses(
     decode: Decoder[PoseMessage], rows: NDArray[np.uint8], receive_ns: IntArray
 ) -> PoseBlock:
-    """Decode messages (k, size), received at times (k,).
-
-    Raise a :class:`MessageError` if one is malformed, or they do not have all in common.
-    """
+    """Decode messages (k, size) received at times (k,); MessageError if not all are alike."""
     read = decode.block(rows, receive_ns)
     stamps_ns = cast('IntArray', read.stamp_ns)
     return PoseBlock(stamps_ns, read.child_frame_id, read.position, read.quaternion)
@@ -124,10 +121,7 @@ def decode_transform_stamped(reader: CdrReader) -> PoseMessage:
 
 @Decoder
 def decode_transforms(reader: CdrReader) -> list[PoseMessage]:
-    """Read a tf2_msgs/TFMessage, as on /tf and /tf_static.
-
-    A bad transform says so in ``problem``: those beside it are of other frames, and good.
-    """
+    """Read a tf2_msgs/TFMessage, whose bad transforms say so in ``problem``: others are good."""
     return [_read_transform(reader) for _ in range(reader.uint32())]
 
 

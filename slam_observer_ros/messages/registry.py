@@ -56,10 +56,7 @@ class Decoder(Generic[MessageT_co]):
 def reads(
     *names: str, role: Role, package: str = '', definition: str = '', is_ambiguous: bool = False
 ) -> Callable[[Callable[[CdrReader], MessageT]], Decoder[MessageT]]:
-    """Register the decorated function as what reads types such as ``geometry_msgs/msg/Twist``.
-
-    See :class:`.MessageType` for what else may be said of them.
-    """
+    """Register the decorated function as reader of types, as a :class:`.MessageType` has it."""
 
     def registered(read: Callable[[CdrReader], MessageT]) -> Decoder[MessageT]:
         decode = Decoder(read)

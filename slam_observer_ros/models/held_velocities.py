@@ -12,10 +12,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
 
 class Velocities(NamedTuple):
-    """Velocities of one or two sensors, each in force from its stamp to the next.
-
-    Columns of two are of the angular and the linear part.
-    """
+    """Velocities, in force from their stamp to the next; two columns: angular and linear."""
 
     stamps_ns: IntArray  # (r,)
     body_velocities: FloatArray  # (r, 6)
@@ -55,10 +52,7 @@ class HeldVelocities:
 
 
 def held(velocities: Velocities, start_ns: int, end_ns: int) -> HeldVelocities:
-    """Return the velocities in force from one stamp to another.
-
-    A gap, which begins where a velocity has timed out, is a piece of its own.
-    """
+    """Return velocities in force between stamps; gaps, where they time out, are pieces, too."""
     first = int(velocities.stamps_ns.searchsorted(start_ns, 'right')) - 1
     last = max(int(velocities.stamps_ns.searchsorted(end_ns, 'left')), first + 1)
     bounds_ns = np.append(velocities.stamps_ns[first:last], end_ns)

@@ -78,10 +78,7 @@ class Factors(NamedTuple):
 
 
 class MotionNoise:
-    """How far motions may be off: noise densities of the settings, or covariances of messages.
-
-    Either of them times the ``factors`` that were found for turning and driving.
-    """
+    """How far motions may be off, as settings or messages have it, times the ``factors``."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = s = settings
@@ -241,10 +238,7 @@ class MotionFactors:
 def learn(
     factors: Factors, r: FloatArray, S: FloatArray, C: FloatArray, degrees: IntArray, gate: float
 ) -> None:
-    """Let factors learn from residuals r (m, k), with S (m k, m k) and C (m, k, p).
-
-    ``degrees`` (m,) of freedom have those; rows of others are zero but for a variance.
-    """
+    """Let factors learn from r (m, k), S (m k, m k), C (m, k, p), of ``degrees`` (m,) each."""
     # As the likelihood at θ has it, which may be less than is applied.
     ratios = np.exp(factors.logs) / factors.applied
     N = ratios[:, None, None] * factors.shares

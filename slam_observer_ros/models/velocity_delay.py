@@ -47,10 +47,7 @@ class DelayEvidence:
         start_ns: int,
         end_ns: int,
     ) -> None:
-        """Take in a motion between two stamps, of a state that estimates the delay.
-
-        It was off by ``variances`` (6,) by axis, rad² and m².
-        """
+        """Take in a motion between two stamps, off by ``variances`` (6,) by axis, rad² and m²."""
         self._seen += 1
         if self._seen % SAMPLED:
             return

@@ -128,10 +128,7 @@ class VelocityHistory:
 
     @property
     def median_period_s(self) -> float:
-        """Median time between two velocities of late, seconds; 0 while that is not known.
-
-        Means over the time since the last one count as any number of them.
-        """
+        """Median time between velocities, seconds, or 0; means over time count as any number."""
         return self._periods.median_s
 
     def _note_zero(self, stamp_ns: int) -> bool:
@@ -302,10 +299,7 @@ class _AtRest:
 
 
 class _Periods:
-    """For how long messages of one sensor are in force as a rule.
-
-    ``usual_s`` is the longest period lately but one, seconds; infinite before there are two.
-    """
+    """How long messages are in force as a rule, ``usual_s``: the longest period but one."""
 
     def __init__(self) -> None:
         self._block_ns: list[int] = []
@@ -344,10 +338,7 @@ class _Periods:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Joined:
-    """Velocities in force from one event to the next, each of one message or two.
-
-    Columns of two: angular and linear part, with the stamp of the message that each is of.
-    """
+    """Velocities in force between events; two columns: angular and linear part's message."""
 
     stamps_ns: IntArray  # (c,) from when on each is in force
     body_velocities: FloatArray  # (c, 6)

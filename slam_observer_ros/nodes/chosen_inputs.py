@@ -107,10 +107,7 @@ WITHOUT_TAG_S = 20.0  # time without any fiducial on /tf after which their names
 
 
 class CloudDecoder:
-    """Decodes clouds of a type; warns once if their points have no ids.
-
-    These are then distinguished by their positions, as is wanted, or as a name is misspelt.
-    """
+    """Decodes clouds of a type; warns once if points have no ids, as a misspelt field has it."""
 
     def __init__(self, node: Node, message_type: str) -> None:
         self._node, self._message_type = node, message_type

@@ -224,10 +224,7 @@ class EstimatePublisher:
             self.broadcaster.repeat(self._node.get_clock().now().nanoseconds)
 
     def reset(self) -> None:
-        """Forget the path and what waits: the estimate has another pose, frame or time.
-
-        The map that is out, which is latched, and the markers are replaced.
-        """
+        """Forget the path, what waits and landmarks that are out: the estimate is another one."""
         self._path.clear()
         self._path_stamp_ns = None
         if self.broadcaster is not None:

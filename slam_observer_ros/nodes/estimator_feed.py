@@ -169,10 +169,7 @@ class EstimatorFeed:
             self._on_waiting()
 
     def begin_clock_jump(self, back_ns: int) -> None:
-        """Use only what is of the time before /clock has jumped back, nanoseconds, until the end.
-
-        What is of the time since is kept.
-        """
+        """Use until the end only what is of before /clock jumped back, and keep the others."""
         self._change.begin(back_ns)
 
     def end_clock_jump(self) -> None:

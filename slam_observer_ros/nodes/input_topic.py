@@ -105,10 +105,7 @@ class LoadShedding:
         self.shed = 0  # messages dropped so far
 
     def newest(self, waiting: Sequence[Waiting], now_ns: int, now_s: float) -> list[Waiting]:
-        """Return which of the messages that wait, in order of reception, are to be used.
-
-        ``now_ns`` is the system's time, by which they were received, ``now_s`` a steady one.
-        """
+        """Return which waiting messages are used at ``now_ns``, the system's, ``now_s`` steady."""
         oldest_ns = min((each.received_ns for each in waiting if each.received_ns), default=now_ns)
         kept = list(waiting)
         if to_s(now_ns - oldest_ns) > self._max_wait_s:

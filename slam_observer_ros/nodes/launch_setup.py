@@ -12,10 +12,7 @@ from slam_observer_ros.nodes.ros_node import install_command
 
 
 def check_file(context: Any, name: str, may_be_folder: bool = False) -> None:
-    """Expand ~ in the launch argument ``name``; raise a RuntimeError if there is no such file.
-
-    Launch itself would only warn, and start the node with its defaults.
-    """
+    """Expand ~ in a launch argument; raise a RuntimeError, not a warning, if no file is there."""
     written = context.launch_configurations[name]
     try:
         path = Path(written).expanduser().absolute()

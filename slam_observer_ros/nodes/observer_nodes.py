@@ -254,10 +254,7 @@ class ObserverCore:
             timer.cancel()
 
     def close(self) -> None:
-        """Save the map if that was asked for, and remove all from the node again.
-
-        Raises a MapError if the map can't be saved; all is removed nevertheless.
-        """
+        """Save the map if that was asked for, or raise a MapError; remove all from the node."""
         try:
             self._kept_pose.keep()
             self._maps.save_at_end()
@@ -321,10 +318,7 @@ TIMEOUT_S = 4.0  # without a heartbeat after which the manager is given up, as i
 
 
 class LifecycleBond:
-    """Heartbeats to the lifecycle manager while the node is active.
-
-    Raises a ParameterError where they are asked for, and bondpy is not installed.
-    """
+    """Heartbeats to the lifecycle manager of an active node; ParameterError without bondpy."""
 
     def __init__(self, node: Node, heartbeat_period_s: float) -> None:
         self._node, self._period_s = node, heartbeat_period_s

@@ -241,10 +241,7 @@ class Entities:
         self._known = self._present()
 
     def remove_new(self) -> None:
-        """Destroy what the node has got since; nothing of it is called any more.
-
-        An executor may have heard already that something is due, and calls it all the same.
-        """
+        """Destroy what the node has got since; an executor that holds it calls nothing of it."""
         for remove, entities in self._present().items():
             for entity in entities - self._known[remove]:
                 if hasattr(entity, 'callback'):
@@ -317,10 +314,7 @@ def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
 
 
 def with_info(receive: Callable[[bytes, Mapping[str, int]], None]) -> Callable[..., None]:
-    """Return a callback that gets a message with what DDS knows of it from every executor.
-
-    EventsExecutor gives both as one argument, in rclpy 7.1 at least.
-    """
+    """Return a callback for a message with what DDS knows of it: some executors join them."""
 
     def callback(*taken: Any) -> None:
         receive(*(taken[0] if len(taken) == 1 else taken))
@@ -334,10 +328,7 @@ INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
 
 class RepeatableParameters(GuardedNode):
-    """A node where setting a parameter to the value that it has is no failure.
-
-    rclpy refuses that for read-only ones, and most of a dumped file are read-only.
-    """
+    """Takes the value that a parameter has, also of read-only ones, as in a dumped file."""
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set those parameters that are read-only only where they change, all others as ever."""
@@ -399,11 +390,7 @@ def read_settings(node: Node, settings_class: type[SettingsT]) -> SettingsT:
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
-    """Return the ROS descriptor of one row.
-
-    The type is left dynamic so that ``gain:=4`` may set a floating-point parameter; our own check
-    refuses what does not fit, with a better reason than rclpy's.
-    """
+    """Return a row's ROS descriptor; it leaves types dynamic, so ``gain:=4`` may set a float."""
     unit = f' [{row.unit}]' if row.unit else ''
     result = ParameterDescriptor(
         name=row.name,

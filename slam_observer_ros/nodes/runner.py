@@ -122,10 +122,7 @@ def _reason(error: Exception) -> str:
 
 
 def _executor() -> Executor:
-    """Return what hears of each message by itself, where rclpy has it.
-
-    The other one asks all that a node has whenever one message comes: most of the node's CPU time.
-    """
+    """Return what hears of each message by itself, if rclpy has it: the other asks for all."""
     return SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
 
 

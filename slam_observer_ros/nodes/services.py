@@ -39,10 +39,7 @@ MAX_STEP_NS = 500_000_000  # time between two velocities whose stamps are believ
 
 
 class PausedMotion:
-    """Moves the estimate on, at the end of a pause, by what the odometry on /tf did meanwhile.
-
-    The odometry's frame keeps its place in the map, with which /tf has had the robot right.
-    """
+    """Moves the estimate on at the end of a pause as the odometry on /tf did meanwhile."""
 
     def __init__(self, estimator: Estimator, odometry: TransformedOdometry) -> None:
         self._estimator, self._odometry = estimator, odometry
@@ -342,10 +339,7 @@ _FILE_URL = re.compile('file:(?://(?:localhost)?)?(/(?!/).*)', re.IGNORECASE | r
 
 
 class NamedMapServices:
-    """``~/save_map_to`` and ``~/load_map_from``, where nav2_msgs is installed.
-
-    Both take ``map_url``, a path or a file:// URL; what concerns an image is of no use here.
-    """
+    """``~/save_map_to`` and ``~/load_map_from``, of a path or file:// URL, with nav2_msgs."""
 
     def __init__(self, node: Node, maps: MapServices) -> None:
         self._maps = maps

@@ -247,10 +247,7 @@ class PoseBroadcaster:
         return fault('rival', parent=parent, child=child, topic=topic, whose=whose)
 
     def _is_rival(self, parent: str, child: str) -> bool:
-        """Return whether a transform gives a frame a parent that has its own from here.
-
-        The base may have others, for which :meth:`_other_parent` cares.
-        """
+        """Return whether a transform gives another parent to a frame that has its own here."""
         ends = self._ends
         is_of_odometry = bool(parent) and self._child == self._settings.odom_frame
         return bool(self._child) and child == ends[1] and (parent == ends[0] or is_of_odometry)

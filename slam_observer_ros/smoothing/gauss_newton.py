@@ -302,10 +302,7 @@ class Smoother:
         equations.border_gradient[:c] += np.sum(gradient[:, 2 * d :], axis=0)
 
     def _links(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
-        """Return the derivatives of e_s by both poses and the calibration, and e_s (S, d).
-
-        Where the calibration drifts, e_s (S, d + c) ends in c_s − c_{s−1}.
-        """
+        """Return derivatives of e_s (S, d) by poses and calibration; drift adds c_s − c_{s−1}."""
         keyframes, pose = self._keyframes, self._axes.pose
         # The motions, had they been computed with this calibration, and their errors.
         links, eta = keyframes.links, np.zeros((len(keyframes.calibrations), 6))

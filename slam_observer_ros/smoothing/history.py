@@ -78,10 +78,7 @@ class _Link(NamedTuple):
 
 
 class History:
-    """Motions and observations since a prior, keyframe by keyframe.
-
-    ``since`` says in words what happened before the first of them.
-    """
+    """Motions and observations since a prior, before which there was ``since``, in words."""
 
     def __init__(
         self, axes: EstimatedAxes, noise: ObservationNoise, prior: Prior, since: str
@@ -120,10 +117,7 @@ class History:
     def move(
         self, start: FloatArray, motion: Advanced, drift: FloatArray, calibration: Calibration
     ) -> None:
-        """Append a motion from a pose (4, 4) to the one that leads to the next keyframe.
-
-        In its time the covariance of the calibration grows by ``drift`` (c, c).
-        """
+        """Append a motion from a pose (4, 4), with ``drift`` (c, c), until the next keyframe."""
         if self._start is None:
             self._start = start.copy()
         self._end = motion.A

@@ -121,10 +121,7 @@ class SensedPoints:
 
 
 class Observations:
-    """M observations of landmarks; ``huber_threshold`` and ``rejection_threshold`` weigh them.
-
-    ``sensed`` are the points where their sensors are calibrated.
-    """
+    """M observations of landmarks; ``sensed`` are the points of calibrated sensors."""
 
     def __init__(
         self,
@@ -217,10 +214,7 @@ class Observations:
     def _of_turns(
         self, solution: Solution, R: FloatArray, chained: int, counted: FloatArray, gated: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what T orientations say, seen from poses turned by ``R`` (T, 3, 3).
-
-        Nothing, where none is known or the flipped twin is as likely.
-        """
+        """Return what T orientations, if they are sure, say from poses turned by R (T, 3, 3)."""
         axes, q, turns = self._axes, self._axes.turn, self._keyframes.turns
         B = solution.orientations[self._keyframes.landmarks[turns.points]]
         predicted = transpose(R) @ B

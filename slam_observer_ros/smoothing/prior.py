@@ -152,10 +152,7 @@ class Prior:
             C, R = self._output_matrix(axes, y).reshape(-1, d), self._rotation(axes, pose)
 
         def pull_back(rows: FloatArray) -> FloatArray:
-            """Return Jᵀ b for rows b, J = [[J_η, 0, 0], [0, I, 0], [−C, 0, Rᵀ for each point]].
-
-            Of orientations −C and Rᵀ are multiplied by the Jacobian of the logarithm.
-            """
+            """Return Jᵀ b for rows b, J = [[J_η, 0, 0], [0, I, 0], [−C, 0, Rᵀ]], by J_turns."""
             pulled: FloatArray = rows.copy()
             of_turns = pulled[first:].reshape(len(J_turns), k, rows.shape[1])[:, axes.point :]
             of_turns[:] = transpose(J_turns) @ of_turns
@@ -172,10 +169,7 @@ class Prior:
         return se3.transform(se3.inverse(pose), points) if self.is_relative else points
 
     def _turns_from(self, pose: FloatArray, orientations: FloatArray) -> FloatArray:
-        """Return rotation vectors (n, 3) from the known orientations to others (n, 3, 3).
-
-        As points are, they are seen from a pose; zero where one of them is not known.
-        """
+        """Return turns (n, 3) from known orientations to others (n, 3, 3), 0 if one is unknown."""
         are_known = self.orientations.any(axis=(1, 2)) & orientations.any(axis=(1, 2))
         before, now = self.orientations[are_known], orientations[are_known]
         if self.is_relative:

@@ -276,10 +276,7 @@ class Relinearisation:
         return Placed(there, joint[:k, :k] - shared @ joint[k:, :k], cost)
 
     def enter(self, row: int, seen: Keyframe) -> None:
-        """Let marked observations (m,) be all that a landmark was ``seen`` in.
-
-        What is not kept any more stays in what the filter has made of it.
-        """
+        """Let marked observations (m,) that are kept be all that a landmark was ``seen`` in."""
         numbers = np.array(self.history.marked(seen.marks))
         if not self.is_active or numbers.min() < 0:
             return
@@ -406,10 +403,7 @@ class Relinearisation:
             history.summarise(known)
 
     def _relinearise(self, iterations: int = ITERATIONS) -> bool:
-        """Relinearise the keyframes that are not summarised at the present estimates, if possible.
-
-        Return whether it was: if they don't determine everything, more may do so later.
-        """
+        """Relinearise keyframes after the summary; return whether they determine everything."""
         if len(self._errors.joint.P) - self._errors.joint.first > MAX_UNKNOWNS:
             return False
         # Smooth them, after the summary of those before, …
