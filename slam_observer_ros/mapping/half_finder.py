@@ -116,10 +116,7 @@ class HalfFinder:
         self.in_a_line: list[int] = []
 
     def find(self, state: State, window: Window) -> Fix | None:
-        """Return where the robot is; None unless one pose alone fits.
-
-        Also if not much is new since the last search.
-        """
+        """Return where the robot is; None if no or other poses fit, or little is new."""
         if window.seen < self._next:
             return None
         self._next = min(math.ceil(TRY_AGAIN * window.seen), window.seen + MOST_BETWEEN)

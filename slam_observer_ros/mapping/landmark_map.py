@@ -32,10 +32,7 @@ MAX_NUMBER = 1e12  # metres; nothing larger is meant seriously, and its square s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
-    """n landmarks in one frame.
-
-    Their errors are taken to be independent of each other, unless ``joint_covariance`` is there.
-    """
+    """n landmarks in one frame, of independent errors but for a ``joint_covariance``."""
 
     ids: IntArray  # (n,) landmark ids, each one once
     world_points: FloatArray  # (n, 3) positions, metres, in frame_id
@@ -93,19 +90,13 @@ class LandmarkMap:
         return replace(self, world_points=self.world_points * np.array([1.0, 1.0, 0.0]))
 
     def covariances_or(self, sigma_m: float) -> FloatArray:
-        """Return (n, 3, 3) covariances; unknown ones have ``sigma_m`` in each coordinate.
-
-        Standard deviations beyond MAX_DEVIATION say no more than that, and are cut to it.
-        """
+        """Return covariances (n, 3, 3), up to MAX_DEVIATION, of ``sigma_m`` where unknown."""
         if self.covariances is not None:
             return limited(self.covariances, np.full(3, MAX_DEVIATION))
         return np.tile(sigma_m**2 * np.eye(3), (len(self.ids), 1, 1))
 
     def says_the_same(self, other: LandmarkMap) -> bool:
-        """Return whether another map has the same landmarks, where this one says that they are.
-
-        That is within three standard deviations of the difference, and not more than SAME_M.
-        """
+        """Return whether a map has the same landmarks within 3 deviations, and SAME_M at most."""
         if self.frame_id != other.frame_id or len(self.ids) != len(other.ids):
             return False
         others = other.rows_of(self.ids)
@@ -127,10 +118,7 @@ class LandmarkMap:
         return bool((off_rad <= 3.0 * np.sqrt(squares) + ROUNDED_M).all())
 
     def landmarks_in(self, T: FloatArray, sigma_m: float) -> KnownLandmarks:
-        """Return the landmarks with covariances, or :meth:`covariances_or`, in another frame.
-
-        ``T`` (4, 4) leads into it.
-        """
+        """Return landmarks with :meth:`covariances_or` in the frame that T (4, 4) leads into."""
         covariances, joint = self.covariances_or(sigma_m), self.joint_covariance
         if joint is not None:
             # A map's shape says nothing of a motion of everything: that is all but exact, and as
@@ -207,10 +195,7 @@ class MappedLandmarks:
         return np.concatenate([pairs, pairs[:, ::-1]])
 
     def triangles(self, sides_m: FloatArray, tolerances_m: FloatArray) -> IntArray | None:
-        """Return landmarks (h, 3) with distances from 0 to 1, 0 to 2 and 1 to 2 as given (3,).
-
-        None if there are too many to look at.
-        """
+        """Return landmarks (h, 3) of sides 0–1, 0–2, 1–2 (3,); None if there are too many."""
         # Two of them by the shortest side, which the fewest have, in an order that …
         turns = np.argsort(sides_m)
         corners = _CORNERS[turns[0], turns[1]]
@@ -250,10 +235,7 @@ def heights_of(maps: Iterable[LandmarkMap]) -> dict[int, float]:
 
 
 def check_joint(joint: FloatArray, covariances: FloatArray) -> None:
-    """Check a joint covariance of n or more vectors against the landmarks' own (n, 3, 3).
-
-    Raise :exc:`MapError` if there are others on its diagonal, or it is none.
-    """
+    """Raise a :exc:`MapError` unless a joint covariance fits the landmarks' own (n, 3, 3)."""
     joint = np.asarray(joint, dtype=np.float64)
     blocks, scaled = diagonal_blocks(joint, 3)[: len(covariances)], in_own_deviations(joint)
     deviations = np.sqrt(np.maximum(np.diagonal(blocks, axis1=1, axis2=2), LEAST_DEVIATION**2))

@@ -143,10 +143,7 @@ class Localiser:
     def reason_to_reset(
         self, state: State, event: ObservationEvent, update: Update, missed: float
     ) -> str | None:
-        """Return why the pose in the map must be wrong after an observation, or None.
-
-        ``missed`` landmarks should have been among its points without ids, and were not.
-        """
+        """Return why the pose must be wrong; ``missed`` landmarks should have been seen, too."""
         if self.loaded is None:
             return None
         is_elsewhere = False
@@ -203,10 +200,7 @@ class Localiser:
         logger.info('Found the pose in the map by tag %d.', tag_id)
 
     def pose_by_half_points(self, state: State, window: Window) -> Fix | None:
-        """Return where the robot is by the views of ranges or bearings alone.
-
-        None while the pose in the map is known, or they fit no place or several.
-        """
+        """Return where the robot is by half points alone; None if known, or not one place fits."""
         if self.is_localised or not window.views:
             return None
         from slam_observer_ros.mapping.half_finder import HalfFinder  # which few runs need

@@ -61,10 +61,7 @@ class LoopClosure:
         return True
 
     def count_doubled(self, state: State) -> None:
-        """Count landmarks that were added where known ones should be seen, and are not.
-
-        By their joint covariance they can't be these, or they would be merged.
-        """
+        """Count landmarks added where known ones, which they can't be, should be seen."""
         landmarks, known = state.landmarks, state.confirmed
         missed = landmarks.missed[known]
         absent = known[-missed * math.log1p(-landmarks.likely_share) > SHOULD_BE_SEEN]

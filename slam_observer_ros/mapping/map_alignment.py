@@ -85,10 +85,7 @@ def find_transform(
 
 
 def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:
-    """Return the standard deviation of the robot's attitude in a map, about the worst axis.
-
-    Parameters are as for :func:`slam_observer_ros.filter.known_landmarks.anchor`.
-    """
+    """Return the attitude's standard deviation about the worst axis; parameters as `anchor`'s."""
     turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
     try:
         S = P[np.ix_(rows, rows)] + there
@@ -192,10 +189,7 @@ class AlikeMaps:
 
 
 class Differences:
-    """Whether what is seen is where another map has it that is alike, and not where this one has.
-
-    A pose that was given may be in the wrong one of two halls that are nearly the same.
-    """
+    """Whether what is seen is where another map, which is alike, has it, and not this one."""
 
     def __init__(self, known: LandmarkMap, maps: Iterable[LandmarkMap]) -> None:
         # By the other map's name: points that it alone has, and that this one alone has, here.
@@ -282,10 +276,7 @@ CELLS = 40  # along the longer side of a map, free places for one more landmark
 
 
 def symmetries(known: LandmarkMap) -> list[Likeness]:
-    """Return the turns about the vertical after which a map looks the same, the best first.
-
-    Of turns that are as good the smallest is the first, as it makes the others.
-    """
+    """Return upright turns after which a map looks the same: the best first, then the smallest."""
     found = turns_onto(known, known)
     turned = [each for each in found if each.turn_deg > LEAST_TURN_DEG]
     return sorted(turned, key=lambda each: (-int(each.is_same.sum()), round(each.turn_deg)))

@@ -157,10 +157,7 @@ def read_map(path: Path) -> LandmarkMap:
 
 
 def read_maps(path: Path) -> list[LandmarkMap]:
-    """Read a map, or all maps of a folder, where there is one: the robot is in one of them.
-
-    With a warning, files that are no maps are skipped, and of maps that say the same one is taken.
-    """
+    """Read a map, or a folder's; of equal ones the first, others skipped with a warning."""
     files, maps = map_files(path), list[LandmarkMap]()
     if files == [path]:
         return [read_map(path)]
@@ -376,11 +373,7 @@ def _correlation_lines(
 def _correlations(
     content: Any, landmarks: Sequence[Mapping[str, Any]], covariances: FloatArray | None
 ) -> FloatArray:
-    """Return the joint covariance of ``landmarks`` as they were read.
-
-    Raise :exc:`MapError` if it can't be right, or does not fit these landmarks, whose
-    own ``covariances`` (n, 3, 3), m², are known.
-    """
+    """Return the joint covariance of ``landmarks``; MapError if it does not fit them."""
     try:
         is_whole = isinstance(content, dict) and set(content) == {'checksum', 'data'}
         _expect(is_whole, 'they are not of the form {checksum: …, data: …}')

@@ -371,11 +371,7 @@ _FIDUCIAL_SLAM = ('id', 'x', 'y', 'z', 'roll', 'pitch', 'yaw', 'variance', 'obse
 
 
 def _table_rows(path: Path, left_out: list[str]) -> list[Row]:
-    """Read a table; names of columns that are left out are added to ``left_out``.
-
-    Cells are separated by commas, semicolons, tabs or spaces. Raises a MapError that names the
-    line if it can't be right.
-    """
+    """Read a table of cells between commas, semicolons, tabs or spaces; note ``left_out``."""
     text = read_text(path)
     lines = _cells(text)
     if not lines:
@@ -560,11 +556,7 @@ def _fiducial_slam_row(number: int, cells: Sequence[str]) -> Row:
 
 
 def _scanner_rows(path: Path) -> list[Row]:
-    """Read the landmark file of a navigation scanner: id, x and y in mm, and what it is.
-
-    Type, subtype, size and layer, which may follow, say nothing of the place. Raises a MapError
-    that names the line if it can't be right.
-    """
+    """Read a navigation scanner's file: id, x and y in mm, and more that is not used."""
     rows = []
     for number, cells in _cells(read_text(path)):
         with naming(f'line {number}'):

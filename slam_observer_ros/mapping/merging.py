@@ -28,11 +28,7 @@ RANK_TOLERANCE = 1e-8  # share of G's largest singular value: few landmarks leav
 
 
 def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
-    """Add a map to a state at its start, whose pose is given in the map's frame.
-
-    ``pose_covariance`` (6, 6) has rotation vector and position along the map's axes, rad²
-    and m²; None for an exact pose.
-    """
+    """Add a map to a state at its start, of a pose there, exact or of rad² and m² (6, 6)."""
     state.set_pose(state.observer.pose, pose_covariance)
     if state.settings.localization_mode != 'fixed':
         state.gains.add_known(_in_reference_frame(state, known))
@@ -177,11 +173,7 @@ MOVING_SPEED = 0.1  # m/s from which on a landmark is left out of a map; slower 
 
 
 def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
-    """Return the confirmed landmarks at rest.
-
-    ``loaded`` is the map in whose frame they are. In a frame of its own, None, a map has the
-    covariances of its shape alone.
-    """
+    """Return confirmed landmarks at rest, in ``loaded``'s frame or an own one, of its shape."""
     rows = state.confirmed
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
     if state.observer.is_exact and loaded is not None:

@@ -415,11 +415,7 @@ for _name, _rest in _GTEC.items():
 
 @reads('sensor_msgs/msg/Range', role='landmarks', is_ambiguous=True)
 def decode_range(reader: CdrReader) -> ObservationEvent:
-    """Read a sensor_msgs/Range of a landmark whose id is the number that ends the frame's name.
-
-    What is nearer or further than the sensor can measure is left out. Releases until Iron have no
-    variance.
-    """
+    """Read a sensor_msgs/Range within its limits, of the id that ends the frame's name."""
     stamp_ns, frame_id = reader.header()
     reader.uint8()  # radiation
     _, nearest, furthest, measured = reader.float32(4)

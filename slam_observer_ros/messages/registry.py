@@ -76,22 +76,14 @@ def decoders(role: Role) -> dict[str, Decoder[Any]]:
 
 
 class BlockDecoder:
-    """Decodes velocities of many messages at once, as ``decode`` does each of them.
-
-    The first block shows whether it can: a decoder that looks at single numbers reads one message
-    only.
-    """
+    """Decodes velocities of many messages at once, if the first block shows that it can."""
 
     def __init__(self, decode: Decoder[VelocityEvent]) -> None:
         self._decode = decode
         self._is_right: bool | None = None
 
     def __call__(self, rows: NDArray[np.uint8], receive_ns: IntArray) -> VelocityBlock:
-        """Return the velocities of messages (k, size) received at times (k,).
-
-        Raise a :class:`MessageError` if one of them is malformed, or they have not all in common,
-        or have to be read one by one.
-        """
+        """Return velocities of messages (k, size) of times (k,); MessageError if they differ."""
         if self._is_right is not False:
             try:
                 read = self._decode.block(rows, receive_ns)

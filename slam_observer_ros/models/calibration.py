@@ -232,10 +232,7 @@ class Calibration:
     def estimates(
         self, variances: FloatArray, values: FloatArray | None = None
     ) -> list[CalibrationEstimate]:
-        """Return the estimates with ``variances`` (c,), what the filter knows of them.
-
-        Or ``values`` (c,) in place of the present ones.
-        """
+        """Return the estimates, or ``values`` (c,), with the filter's ``variances`` (c,)."""
         values = self.values if values is None else values
         stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
         estimates = []
@@ -265,10 +262,7 @@ class Calibration:
     def apply_to_covariance(
         self, covariance: FloatArray, body_velocity: FloatArray, variances: FloatArray
     ) -> FloatArray:
-        """Return the covariance (6, 6) of a calibrated velocity, given the velocity's own.
-
-        ``variances`` (c,) are of the estimates, by the filter.
-        """
+        """Return a calibrated velocity's covariance (6, 6), by its own and ``variances`` (c,)."""
         M = self.rates[:, :MOVES]
         applied: FloatArray = M @ covariance @ M.T
         shares = variances[: len(self._rows)] * self._rates(body_velocity[None])[0] ** 2

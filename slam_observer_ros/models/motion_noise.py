@@ -201,10 +201,7 @@ class MotionFactors:
         self._shares = None if shares is None or self._shares is None else self._shares + shares
 
     def learn(self, r: FloatArray, S: FloatArray, C: FloatArray) -> None:
-        """Take in residuals r (m, k), metres, with S (m k, m k) and C (m, k, p), as they are used.
-
-        They are of the motions since the last time.
-        """
+        """Take in r (m, k), S (m k, m k) and C (m, k, p) since the last time, as they are used."""
         if (factors := self.flat()) is not None:
             degrees = np.full(len(r), r.shape[1])
             learn(factors, r, S, C, degrees, self._settings.rejection_threshold)

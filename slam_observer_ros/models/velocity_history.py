@@ -73,10 +73,7 @@ class VelocityHistory:
         self.at_rest = _AtRest(self._counts * (np.zeros(3) if bias is None else -bias))
 
     def append(self, measured: MeasuredVelocity) -> bool:
-        """Add velocities that are not earlier than any other; return whether they are in force.
-
-        An angular velocity waits for the first linear one.
-        """
+        """Add later velocities; return if in force: angular ones wait for the first linear one."""
         stand: list[int] = []  # which of the new ones are of a robot that stands
         if isinstance(measured, AngularVelocityEvent):
             self._angular_periods.add(measured.stamp_ns)
@@ -179,10 +176,7 @@ class VelocityHistory:
         return self._counting(joined.body_velocities[row])
 
     def in_force(self, stamp_ns: int) -> HeldVelocities | None:
-        """Return the velocity in force at ``stamp_ns``, held for as long as messages usually are.
-
-        It is in the gap between messages if it has timed out; None if no two are known yet.
-        """
+        """Return the velocity in force, for a usual time or in a gap; None before the second."""
         row, joined = self._row(stamp_ns) - 1, self._joined
         period_s = self._periods.usual_s
         if math.isinf(period_s):  # of means over time, which have none

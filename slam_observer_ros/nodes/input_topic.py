@@ -93,11 +93,7 @@ class Waiting:
 
 
 class LoadShedding:
-    """Drops old messages once one has waited too long, so that an estimate does not age.
-
-    If one has waited for longer than ``max_wait_s`` seconds to be read, only the newest of each
-    sensor is used.
-    """
+    """Uses each sensor's newest message alone once one has waited for ``max_wait_s``."""
 
     def __init__(self, max_wait_s: float) -> None:
         self._max_wait_s = max_wait_s

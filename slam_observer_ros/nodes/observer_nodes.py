@@ -182,11 +182,7 @@ CLOCK_JITTER_NS = 100_000_000  # a /clock that steps back by less has not jumped
 
 
 class ObserverCore:
-    """The flow of data, what says how that goes, and what others may do to it.
-
-    The node's parameters are declared. Raises a SlamObserverError if one, or a file that it names,
-    can't be used.
-    """
+    """The flow of data, its state and controls; SlamObserverError if it can't be set up."""
 
     def __init__(self, node: GuardedNode) -> None:
         self._node = node

@@ -132,11 +132,7 @@ SENT = 10  # messages that may be on their way back at once
 
 
 class TransformPublisher:
-    """Publishes single transforms on ``/tf``, or latched on ``/tf_static``.
-
-    Without tf2_msgs it logs so once and does nothing: ``publisher`` is None. ``sent`` are the last
-    messages.
-    """
+    """Publishes transforms, the last ones ``sent``; ``publisher`` is None without tf2_msgs."""
 
     def __init__(self, node: Node, topic: str, qos: QoSProfile) -> None:
         self.sent: deque[bytes] = deque(maxlen=SENT)

@@ -308,10 +308,7 @@ class Relinearisation:
         self.history.remove(rows)
 
     def merge(self, rows: IntArray, copies: IntArray) -> None:
-        """Take landmarks ``copies`` (m,) for ``rows`` (m,), as the filter has done.
-
-        A summary that has both can't be merged: the filter's present estimate becomes the summary.
-        """
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,), in a new summary if one has both."""
         were_summed_up = np.min(copies) < len(self.history.summary.points)
         self.history.merge(rows, copies)
         if were_summed_up and self.is_active:
