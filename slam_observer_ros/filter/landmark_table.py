@@ -230,6 +230,11 @@ class LandmarkTable(LandmarkColumns):
         return min(max(share, MIN_SHARE), MOST_SHARE)
 
     @property
+    def rate(self) -> float:
+        """−ln of the probability that a landmark in view, not hidden, is missed once."""
+        return -math.log1p(-self.likely_share)
+
+    @property
     def false_share(self) -> float:
         """The probability that one just seen does not exist."""
         return 1.0 / (1.0 + math.exp(self.prior))
@@ -257,13 +262,13 @@ class LandmarkTable(LandmarkColumns):
         """Return the probability that existing ``rows`` (m,), in view, are missed once more.
 
         The rate at which one in view is seen differs between landmarks and places. Where it is
-        exponentially distributed about its mean p, one is missed k times in a row from one place
-        with the probability 1/(1 + k p): one that is hidden soon says little more, from there.
-        From n places it is (1 + k p / n)⁻ⁿ.
+        exponentially distributed about its mean q, one is missed k times in a row from one place
+        with the probability 1/(1 + k q): one that is hidden soon says little more, from there.
+        From n places it is (1 + k q / n)⁻ⁿ.
         """
-        p, k, n = self.likely_share, self.missed[rows], 1 + self.passed[rows]
+        q, k, n = self.rate, self.missed[rows], 1 + self.passed[rows]
         then = n + has_moved
-        before, after = n * np.log1p(k * p / n), then * np.log1p((k + 1) * p / then)
+        before, after = n * np.log1p(k * q / n), then * np.log1p((k + 1) * q / then)
         return np.asarray(np.exp(before - after))
 
     def unlikely(self) -> IntArray:

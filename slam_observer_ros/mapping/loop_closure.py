@@ -64,7 +64,7 @@ class LoopClosure:
         """Count landmarks added where known ones, which they can't be, should be seen."""
         landmarks, known = state.landmarks, state.confirmed
         missed = landmarks.missed[known]
-        absent = known[-missed * math.log1p(-landmarks.likely_share) > SHOULD_BE_SEEN]
+        absent = known[missed * landmarks.rate > SHOULD_BE_SEEN]
         added = known[is_automatic(landmarks.ids[known]) & (missed == 0)]
         if not len(absent) or not len(added):
             return
@@ -163,12 +163,12 @@ def _evidence(
     that the other is seen is hidden, as in :meth:`.LandmarkTable.hidden`; beside one alone there
     are false points.
     """
-    counts, p = landmarks.counts, landmarks.likely_share
+    counts, q = landmarks.counts, landmarks.rate
     misses = np.maximum(landmarks.in_view - counts, 0)
     alone = np.minimum(counts[rows] - beside, misses[others])
     alone = np.maximum(alone + np.minimum(counts[others] - beside, misses[rows]), 0)
     expected = landmarks.false_share * np.maximum(alone + beside, 1)
-    return np.asarray(np.log1p(p * alone) - beside * np.log1p(1.0 / expected))
+    return np.asarray(np.log1p(q * alone) - beside * np.log1p(1.0 / expected))
 
 
 def _blocks(state: State, rows: IntArray) -> FloatArray:

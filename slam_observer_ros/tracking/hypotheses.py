@@ -166,7 +166,8 @@ class Hypotheses:
         """
         for hypothesis in list(self._all):
             most = hypothesis.state.settings.rejection_threshold**2 / hypothesis.state.axes.point
-            while (ways := find(hypothesis.state, hypothesis.apart)) and len(ways[0].rows):
+            ways = find(hypothesis.state, hypothesis.apart)
+            while any(len(way.rows) for way in ways):
                 ids, followed = hypothesis.state.landmarks.ids, [hypothesis]
                 pairs = [_pairs(ids, way) for way in ways]
                 apart = hypothesis.apart.union(*pairs)
@@ -182,6 +183,7 @@ class Hypotheses:
                 if len(followed) > 1:
                     _part(followed, int(hypothesis.state.landmarks.last_seen_ns.max()))
                     self._all += followed[1:]
+                ways = find(hypothesis.state, hypothesis.apart)
         self._go_on_with(sorted(self._all, key=lambda one: one.cost)[: self._limit])
         least_cost = self._all[0].cost
         for hypothesis in self._all:

@@ -161,7 +161,7 @@ class Visibility:
         if (old & seen).any():
             self._evidence = 0.0
         elif len(event.points) and self.field_of_view.is_known:
-            evidence = -math.log1p(-landmarks.likely_share) * int(np.sum(old))
+            evidence = landmarks.rate * int(np.sum(old))
             self._evidence += min(evidence, MAX_EVIDENCE)
         is_unexpected = self._evidence > IMPROBABLE
         if is_unexpected or self._evidence == 0.0:

@@ -79,12 +79,12 @@ def miss(landmarks, row, times, has_moved=False):
 
 @pytest.mark.parametrize('share', [0.1, 0.5, 0.9])
 def test_a_landmark_exists_less_surely_with_each_look_that_misses_it(share):
-    """By 1/(1 + k p) after k of them: from one place it may be hidden in all."""
+    """By 1/(1 − k ln(1 − p)) after k of them: from one place it may be hidden in all."""
     landmarks = table([1], 100, round(100 * share))
     odds = np.exp(landmarks.prior)
     for misses in (1, 4, 15):
         miss(landmarks, 1, misses - landmarks.missed[1])
-        left = odds / (1.0 + misses * share)
+        left = odds / (1.0 - misses * np.log(1.0 - share))
         assert_allclose(landmarks.existence(np.array([1]))[0], left / (1.0 + left))
 
 
@@ -142,7 +142,8 @@ def test_misses_from_places_alike_count_as_of_each_of_them(places):
     for place in range(places):
         miss(landmarks, 1, 1, has_moved=place > 0)
         miss(landmarks, 1, 4)
-    assert_allclose(landmarks.evidence[1] - before, -places * np.log1p(5 * 0.9), rtol=0.3)
+    lost = before - landmarks.evidence[1]
+    assert_allclose(lost, places * np.log1p(5 * landmarks.rate), rtol=0.3)
     landmarks.note_in_view(row, np.array([True]))
     assert landmarks.missed[1] == landmarks.passed[1] == 0
 
@@ -170,7 +171,7 @@ def test_before_it_is_known_where_a_sensor_looks_no_place_is_unexpected():
 
 @pytest.mark.parametrize('misses', [1, 5, 40])
 def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_soon_no_more(misses):
-    """After k looks that miss it 2 ln(1 + k p): for the first one much, by and by little."""
+    """After k looks that miss it 2 ln(1 − k ln(1 − p)): for the first much, by and by little."""
     landmarks, share, visibility = table([], 10, 5), 0.5, Visibility(2)
     state = state_of(landmarks, np.array([[2.0, 0.0, 0.0]]))
     ahead = 4.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]])
@@ -181,7 +182,7 @@ def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_so
     for landmarks.missed[0] in range(misses):
         costs.append(visibility.note(state, others, some_have_ids=False))
     assert costs[0] == 0.0, 'before anything was seen it is not known where the sensor looks'
-    assert_allclose(sum(costs), 2.0 * np.log1p(misses * share))
+    assert_allclose(sum(costs), 2.0 * np.log1p(-misses * np.log(1.0 - share)))
     landmarks.last_seen_ns[0] = others.stamp_ns
     assert visibility.note(state, others, some_have_ids=False) == 0.0
 
