@@ -201,7 +201,7 @@ class Update:
 class CalibrationEstimate:
     """What was found out about one property of the velocity, or of a sensor.
 
-    ``name`` is ``angular_scale_z``, ``angular_bias_z``, ``velocity_delay`` and so on; a scale is
+    ``name`` is ``angular_scale_z``, ``linear_bias_x``, ``velocity_delay`` and so on; a scale is
     the factor that the velocity is multiplied by, its ``unit`` is ''. ``nominal`` is the value at
     the start, ``stated`` the standard deviation that the settings state, infinite where the value
     may drift away from there.

@@ -7,7 +7,7 @@ distinguish.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 import math
 from typing import Any
@@ -135,7 +135,11 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError('a recording is given twice; what is trained on can not be held out, too')
     # What the settings that are tried give reason to warn of is nobody's concern.
     with muted_warnings(), progress_bar('calibrating') as advance:
-        found = _found(args, request, materials, given, lambda: advance(1))
+        if args.only == 'noise':
+            found = find_noise(materials, request.settings, lambda: advance(1))
+        else:
+            kept = request.settings, given.assigned, lambda: advance(1)
+            found = CalibrationFinder(materials[0], *kept).find(args.keep_noise)
         stated = state_found(request.settings, request.inputs, found, _sensor_pose(request, found))
         states_motion = any(
             isinstance(event, VelocityEvent) and event.covariance is not None
@@ -199,19 +203,6 @@ class _Calibration:
         """Pairs of values that can't be distinguished."""
         of_size = [COMMON_SCALE] if self.found.has_no_size else []
         return of_size + trades(self.found.parts, self.found.correlations)
-
-
-def _found(
-    args: argparse.Namespace,
-    request: Request,
-    materials: Sequence[Material],
-    given: Given,
-    advance: Callable[[], None],
-) -> Found:
-    if args.only == 'noise':
-        return find_noise(materials, request.settings, advance)
-    finder = CalibrationFinder(materials[0], request.settings, given.assigned, advance)
-    return finder.find(args.keep_noise)
 
 
 def _sensor_pose(request: Request, found: Found) -> FloatArray | None:
@@ -318,6 +309,7 @@ _WORDS = {
     'linear_scale': 'wheel scale',
     'angular_scale': 'scale of turning',
     'angular_bias': 'bias of turning',
+    'linear_bias': 'bias of driving',
     'velocity_delay': 'delay',
     'sensor_rotation': 'mount angle',
     'sensor_translation': 'mount offset',
@@ -452,10 +444,7 @@ def state_found(
         text = f'{part.name}: {part}, looked for within {looked_for(part)}'
         comments.setdefault(entry.parameter, []).append(text)
     groups = [
-        (
-            '\n'.join(lines),
-            {name: values[name] for name in (of, f'{of}_stddev') if name in values},
-        )
+        ('\n'.join(lines), {name: values[name] for name in (of, f'{of}_stddev') if name in values})
         for of, lines in comments.items()
     ]
     if is_one and found.depth_gain is not None:

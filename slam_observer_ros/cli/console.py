@@ -1,7 +1,4 @@
-"""What the command line says: results on standard output, messages and progress beside them.
-
-And what completes a word, if a shell asks for that.
-"""
+"""What the command line says: results on standard output, messages and progress beside them."""
 
 from __future__ import annotations
 
@@ -132,10 +129,3 @@ def table_of(title: str, rows: Mapping[str, str]) -> Table:
     for name, value in rows.items():
         table.add_row(name, value)
     return table
-
-
-def typed_words(environment: Mapping[str, str]) -> list[str] | None:
-    """Return the words after the program that a shell wants completed; None if it wants none."""
-    if '_ARGCOMPLETE' not in environment:
-        return None
-    return environment.get('COMP_LINE', '').split()[1:]

@@ -9,12 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.options import (
-    check_inputs_are_kept,
-    check_outputs,
-    FORCE,
-    options,
-)
+from slam_observer_ros.cli.options import check_inputs_are_kept, check_outputs, FORCE, options
 from slam_observer_ros.common.errors import failing, OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import found

@@ -17,12 +17,7 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
-    from slam_observer_ros.cli.console import (
-        MessageHandler,
-        PROGRAM,
-        show_message,
-        typed_words,
-    )
+    from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
     from slam_observer_ros.common import __version__
     from slam_observer_ros.common.errors import (
         IncompleteError,
@@ -40,16 +35,16 @@ EXIT_INCOMPLETE = 4
 EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EXIT_INCOMPLETE}
 
 COMMANDS = {
-    'simulate': ('simulate', "run the paper's simulation"),
-    'convert': ('convert', 'make a recording of a public data set, or a TUM file of poses'),
-    'map': ('map', 'make a map file of a map of another program, or check one'),
-    'replay': ('replay', 'run a recording through the observer'),
-    'calibrate': ('calibrate', 'find how sensor and odometry err, or their noise alone'),
-    'config': ('config', 'show parameter files, and what can be in them'),
-    'doctor': ('doctor', 'say what is installed, and what a node would hear'),
-    'batch': ('batch', 'run many recordings with many settings'),
+    'simulate': "run the paper's simulation",
+    'convert': 'make a recording of a public data set, or a TUM file of poses',
+    'map': 'make a map file of a map of another program, or check one',
+    'replay': 'run a recording through the observer',
+    'calibrate': 'find how sensor and odometry err, or their noise alone',
+    'config': 'show parameter files, and what can be in them',
+    'doctor': 'say what is installed, and what a node would hear',
+    'batch': 'run many recordings with many settings',
 }
-"""The module of each command, and what it does; only the one that is given is imported."""
+"""What each command does; its module has its name, and only the one that is given is imported."""
 
 OPTIONAL_PACKAGES = ('rosbags', 'mcap', 'matplotlib', 'rich', 'argcomplete')
 """What the extra ``cli`` of setup.py installs: a robot that only runs a node does without."""
@@ -103,11 +98,11 @@ def make_parser(arguments: Sequence[str]) -> Parser:
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     given = next((word for word in arguments if not word.startswith('-')), None)
-    for name, (module, help_text) in COMMANDS.items():
+    for name, help_text in COMMANDS.items():
         command = commands.add_parser(name, help=help_text)
         if name == given:
             with leaving_at_once():
-                import_module(f'slam_observer_ros.cli.{module}').add_options(command)
+                import_module(f'slam_observer_ros.cli.{name}').add_options(command)
     return parser
 
 
@@ -121,9 +116,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
         words = sys.argv[1:] if arguments is None else arguments
-        if (typed := typed_words(os.environ)) is not None:
+        if '_ARGCOMPLETE' in os.environ:  # a shell wants a word completed
             import argcomplete  # which --help has no use for
 
+            typed = os.environ.get('COMP_LINE', '').split()[1:]
             argcomplete.autocomplete(make_parser(typed))  # and ends
         use_one_thread()
         with leaving_at_once():

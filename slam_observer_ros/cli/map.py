@@ -10,12 +10,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.options import (
-    check_inputs_are_kept,
-    check_outputs,
-    FORCE,
-    options,
-)
+from slam_observer_ros.cli.options import check_inputs_are_kept, check_outputs, FORCE, options
 from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.finder import look_around
 from slam_observer_ros.mapping.map_alignment import place_for_another, symmetries

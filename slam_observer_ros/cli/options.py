@@ -65,9 +65,8 @@ def options(group: Any, text: str, **more: Mapping[str, Any]) -> None:
     other arguments of ``add_argument`` for some options, and a ``completer`` of their values.
     """
     types: dict[str, Any] = {'TOPIC': named, 'FRAME': named, 'NAME': named}
-    types |= dict.fromkeys(
-        ('FILE', 'DIR', 'FOLDER', 'RECORDING', 'MAP', 'SURVEY', 'OUT'), named_path
-    )
+    files = ('FILE', 'DIR', 'FOLDER', 'RECORDING', 'MAP', 'SURVEY', 'OUT')
+    types |= dict.fromkeys(files, lambda text: Path(named(text)))
     types |= {'ID': int, 'N': int, 'S': float, 'OUT.mcap': recording_path}
     for line in re.split(r'\n(?=\S)', cleandoc(text)):
         words, _, help_text = line.partition(': ')
@@ -252,11 +251,7 @@ def _shipped_configs() -> dict[str, Path]:
 
 _INPUT_ROWS = {row.name: row for row in table(InputSettings)}
 
-INSTEAD = {
-    'map_file': '--load-map',
-    'autosave_map': '--map',
-    'velocity_type': '--velocity-topic',
-}
+INSTEAD = {'map_file': '--load-map', 'autosave_map': '--map', 'velocity_type': '--velocity-topic'}
 """Options of a replay for what the node does by these parameters."""
 
 
@@ -424,11 +419,6 @@ def named(text: str) -> str:
     if not text:
         raise argparse.ArgumentTypeError('the name is empty; . is this directory')
     return text
-
-
-def named_path(text: str) -> Path:
-    """Take the name of a file or directory, as an argparse type."""
-    return Path(named(text))
 
 
 def value_of(row: Parameter) -> Callable[[str], Value]:

@@ -9,12 +9,7 @@ import logging
 import math
 from pathlib import Path
 
-from slam_observer_ros.cli.console import (
-    print_columns,
-    print_json,
-    print_table,
-    show_progress,
-)
+from slam_observer_ros.cli.console import print_columns, print_json, print_table, show_progress
 from slam_observer_ros.cli.options import (
     add_run_options,
     add_settings_options,
@@ -26,12 +21,7 @@ from slam_observer_ros.cli.options import (
     read_request,
     warn_of_unused,
 )
-from slam_observer_ros.common.errors import (
-    LossError,
-    OutputError,
-    SlamObserverError,
-    UsageError,
-)
+from slam_observer_ros.common.errors import LossError, OutputError, SlamObserverError, UsageError
 from slam_observer_ros.common.findings import kept_warnings
 from slam_observer_ros.estimator.event_warnings import listed
 from slam_observer_ros.events import UNKNOWN_ID
@@ -104,11 +94,7 @@ def run(args: argparse.Namespace) -> None:
     outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
         ('trajectory', args.tum, lambda path: write_tum(result.trajectory, path)),
         ('map', args.map, lambda path: _write_map(result, path)),
-        (
-            'report',
-            args.report,
-            lambda path: write_report(path, result, title, rows),
-        ),
+        ('report', args.report, lambda path: write_report(path, result, title, rows)),
     )
     written = {} if args.mcap is None else {'recording': str(args.mcap)}
     errors: list[str] = []

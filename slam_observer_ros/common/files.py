@@ -179,10 +179,7 @@ _CONSTRUCTOR: Final = yaml.constructor.SafeConstructor()
 
 
 def load_yaml(
-    path: Path,
-    max_bytes: int,
-    plain: Callable[[str], object],
-    loader: Any = yaml.SafeLoader,
+    path: Path, max_bytes: int, plain: Callable[[str], object], loader: Any = yaml.SafeLoader
 ) -> Any:
     """Return the content of a YAML file; ``plain`` gives the values of unquoted words.
 
@@ -197,7 +194,9 @@ def load_yaml(
     try:
         return _Builder(yaml.parse(data, loader), plain).document()
     except yaml.YAMLError as error:
-        raise YamlError(_reason_of(error)) from error
+        if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
+            raise YamlError(f'{error.problem} in line {error.problem_mark.line + 1}') from error
+        raise YamlError(str(error).splitlines()[0]) from error
 
 
 def constructed(kind: str, text: str) -> object:
@@ -250,10 +249,8 @@ class _Builder:
             raise _marked(event, f'the tag {shown(event.tag)}, which is not taken,')
         if level > MAX_LEVELS:
             raise _marked(event, f'more than {MAX_LEVELS} levels')
-        is_mapping = isinstance(event, yaml.MappingStartEvent)
-        return self._mapping(level) if is_mapping else self._list(level)
-
-    def _list(self, level: int) -> list[Any]:
+        if isinstance(event, yaml.MappingStartEvent):
+            return self._mapping(level)
         values = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
             values.append(self._value(event, level + 1))
@@ -274,24 +271,14 @@ class _Builder:
         is_plain, is_text = event.implicit
         if is_text:
             return event.value
+        kind = '' if is_plain else event.tag.removeprefix(_STANDARD)
+        if kind and kind not in _SCALARS:
+            raise _marked(event, f'the tag {shown(event.tag)}, which is not taken,')
         try:
-            return self._plain(event.value) if is_plain else _of_tag(event.tag, event.value)
+            return constructed(kind, event.value) if kind else self._plain(event.value)
         except ValueError as error:
             raise _marked(event, str(error)) from error
 
 
-def _of_tag(tag: str, text: str) -> object:
-    kind = tag.removeprefix(_STANDARD)
-    if kind not in _SCALARS:
-        raise ValueError(f'the tag {shown(tag)}, which is not taken,')
-    return constructed(kind, text)
-
-
 def _marked(event: Any, problem: str) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
-
-
-def _reason_of(error: yaml.YAMLError) -> str:
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
-        return f'{error.problem} in line {error.problem_mark.line + 1}'
-    return str(error).splitlines()[0]

@@ -36,7 +36,7 @@ DESIGNS: dict[str, type[Gains]] = {
 """The values of the parameter ``gains``, and what they are."""
 
 GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
-"""Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
+"""Standard deviation of a pose in a map that is given without any, rad and m: RViz's, AMCL's."""
 
 
 def make_gains(
@@ -160,11 +160,7 @@ class Placement:
             self.localiser.search_near(rough, given + np.diag(GIVEN_POSE_STD**2))
 
     def _start_where_settings_say(self) -> None:
-        pose, of_position_and_turn = (
-            self._settings.initial_pose,
-            self._settings.initial_pose_stddev,
-        )
-        self.start(se3.from_rpy(pose), np.diag(np.repeat(of_position_and_turn[::-1], 3) ** 2))
+        self.start(se3.from_rpy(self._settings.initial_pose), np.diag(GIVEN_POSE_STD**2))
 
     def _state_at(self, pose: FloatArray) -> State:
         """Return a state at its start, with P° = ``pose`` (4, 4)."""

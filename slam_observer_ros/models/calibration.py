@@ -53,18 +53,19 @@ def _entries(parameter: str, places: Iterable[int]) -> list[Entry]:
     field = Settings.__dataclass_fields__[f'{parameter}_stddev']
     each = [('_x', 0), ('_y', 1), ('_z', 2)] if isinstance(field.default, tuple) else [('', None)]
     return [
-        Entry(parameter + suffix, parameter, axis, place, field.metadata['unit'])
+        Entry(parameter + suffix, parameter, axis, place, field.metadata.get('unit', ''))
         for (suffix, axis), place in zip(each, places, strict=True)
     ]
 
 
 _PLACES = np.arange(DELAY).reshape(6, 7)  # of [M b]
-_SCALES, _BIASES = np.diagonal(_PLACES).tolist(), _PLACES[:3, MOVES].tolist()
+_SCALES, _BIASES = np.diagonal(_PLACES).tolist(), _PLACES[:, MOVES].tolist()
 # All that may be calibrated of velocities, the delay last: one more entry of M is a row more.
 OF_VELOCITY = (
     *_entries('angular_scale', _SCALES[:3]),
     *_entries('linear_scale', _SCALES[3:]),
-    *_entries('angular_bias', _BIASES),
+    *_entries('angular_bias', _BIASES[:3]),
+    *_entries('linear_bias', _BIASES[3:]),
     *_entries(DELAY_NAME, [DELAY]),
 )
 

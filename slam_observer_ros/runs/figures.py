@@ -100,10 +100,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 @mpl.rc_context(STYLE)
 def plot_lyapunov(
-    path: Path,
-    times_s: FloatArray,
-    log10_lyapunov: FloatArray,
-    decay: Decay | None = None,
+    path: Path, times_s: FloatArray, log10_lyapunov: FloatArray, decay: Decay | None = None
 ) -> Path:
     """Draw the Lyapunov function (34) over times (k,), as the paper's Fig. 3.
 

@@ -403,6 +403,12 @@ def of_node(
         for each in inputs
         if not each.problem and each.silent_s > SILENT_S
     ]
+    place = rule(not estimator.is_localised, 'unknown_pose')
+    problem = estimator.localisation_problem
+    # Landmarks that came without an id have one that was given here.
+    is_by_place = is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)
+    if place and problem and is_by_place:
+        place.append(problem)
     dropped = rule(progress.is_paused, 'paused')
     # What came while the node was paused or inactive was not to be used.
     if total and not progress.is_paused:
@@ -414,7 +420,7 @@ def of_node(
     has_points = progress.lately['observed_point'] >= MIN_POINTS
     said = [*(each.unread for each in inputs), *(each.doubt for each in inputs)]
     return [
-        *_of_place(estimator),
+        *place,
         *(unused if total and not progress.is_paused else []),
         *silent,
         *dropped,
@@ -426,15 +432,6 @@ def of_node(
         *(of_rejections(progress.lately, 'seen lately ') if has_points else []),
         *of_now(estimator),
     ]
-
-
-def _of_place(estimator: Estimate) -> list[Finding]:
-    if estimator.is_localised:
-        return []
-    findings, problem = [found('unknown_pose')], estimator.localisation_problem
-    # Landmarks that came without an id have one that was given here.
-    is_by_place = is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)
-    return [*findings, problem] if problem and is_by_place else findings
 
 
 def deviations(estimator: Estimate) -> tuple[float, float] | None:

@@ -128,6 +128,9 @@ class Settings:
     angular_bias: Vector3 = parameter(
         (0.0, 0.0, 0.0), 'Added to the angular velocity x y z after that, unless all of it is '
         'zero', unit='rad/s', minimum=-10.0, maximum=10.0)
+    linear_bias: Vector3 = parameter(
+        (0.0, 0.0, 0.0), 'Added to the linear velocity x y z after that, unless all of it is zero',
+        unit='m/s', minimum=-100.0, maximum=100.0)
     velocity_delay: float = parameter(
         0.0, 'How much later than its stamp a velocity shows in observations; below zero if '
         'stamped late', unit='s', minimum=-MAX_DELAY_S, maximum=MAX_DELAY_S)
@@ -141,6 +144,9 @@ class Settings:
         (0.005, 0.005, 0.005), "Riccati: standard deviation of the angular velocity's bias x y "
         'z, which is estimated; the default suits a MEMS gyroscope, or wheels that differ by a '
         'few thousandths; 0 for none', unit='rad/s', minimum=0.0, maximum=10.0)
+    linear_bias_stddev: Vector3 = parameter(
+        (0.0, 0.0, 0.0), "Riccati: standard deviation of the linear velocity's bias x y z, which "
+        'is estimated', unit='m/s', minimum=0.0, maximum=100.0)
     velocity_delay_stddev: float = parameter(
         0.2, 'Riccati: standard deviation of velocity_delay, which is estimated; 0 for none',
         unit='s', minimum=0.0, maximum=MAX_DELAY_S)
@@ -209,14 +215,10 @@ class Settings:
         'exact and at rest', choices=('off', 'uncertain', 'fixed'), basic=True)
     set_initial_pose: bool = parameter(
         False, 'Whether the robot starts at initial_pose: exactly, or in a loaded map within '
-        'initial_pose_stddev, instead of localising by landmarks')
+        '0.5 m and 0.26 rad, instead of localising by landmarks')
     initial_pose: Pose6 = parameter(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 'Where the robot starts, x y z and roll pitch yaw, with '
         'set_initial_pose', unit='m, rad', minimum=-MAX_POSITION_M, maximum=MAX_POSITION_M)
-    initial_pose_stddev: tuple[float, float] = parameter(
-        (0.5, 0.26), 'In a loaded map: standard deviation of each coordinate of initial_pose, '
-        'and of how the robot is turned about each axis',
-        unit='m, rad', minimum=0.0, maximum=1000.0)
     map_noise: float = parameter(
         0.05, 'Standard deviation of each coordinate of loaded landmarks whose file gives none',
         unit='m', minimum=0.0, maximum=1000.0)

@@ -10,11 +10,7 @@ import textwrap
 
 from slam_observer_ros.common.errors import failing, OutputError, ParameterError, shown, YamlError
 from slam_observer_ros.common.files import load_yaml, plain_value, unfinished_file
-from slam_observer_ros.settings.parameter_table import (
-    Parameter,
-    suggestion,
-    Value,
-)
+from slam_observer_ros.settings.parameter_table import Parameter, suggestion, Value
 
 OBSERVER_NODE = 'observer_node'
 

@@ -6,7 +6,7 @@ parameter descriptors, the check of YAML files, the command-line options and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 import dataclasses
 from dataclasses import dataclass
 import difflib
@@ -130,31 +130,13 @@ class Parameter:
         return vector
 
 
-def parameter(
-    default: Value,
-    description: str,
-    *,
-    unit: str = '',
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    choices: tuple[str, ...] | Callable[[], tuple[str, ...]] = (),
-    read_only: bool = True,
-    basic: bool = False,
-) -> Any:
+def parameter(default: Value, description: str, **facts: Any) -> Any:
     """Return a dataclass field that is a row of the table: a :class:`Parameter` of its name.
 
-    ``choices`` may be a function, if they are not known before all modules are there.
+    ``facts`` are its other attributes; ``choices`` may be a function, if they are not known before
+    all modules are there.
     """
-    row = {
-        'description': description,
-        'unit': unit,
-        'minimum': minimum,
-        'maximum': maximum,
-        'choices': choices,
-        'read_only': read_only,
-        'basic': basic,
-    }
-    return dataclasses.field(default=default, metadata=row)
+    return dataclasses.field(default=default, metadata={'description': description, **facts})
 
 
 def table(settings_class: type[Dataclass]) -> tuple[Parameter, ...]:
@@ -164,8 +146,8 @@ def table(settings_class: type[Dataclass]) -> tuple[Parameter, ...]:
 
 def _row(field: dataclasses.Field[Any]) -> Parameter:
     row = dict(field.metadata)
-    if callable(row['choices']):
-        row['choices'] = row['choices']()
+    if callable(choices := row.get('choices')):
+        row['choices'] = choices()
     return Parameter(name=field.name, default=cast('Value', field.default), **row)
 
 

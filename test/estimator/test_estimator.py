@@ -236,7 +236,7 @@ def test_what_was_counted_is_kept_by_a_reset():
 def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
     asked = {
         'landmark_velocity_stddev': 0.1,
-        'linear_scale_stddev': (0.2, 0.0, 0.0),
+        'linear_bias_stddev': (0.2, 0.0, 0.0),
         'calibration_drift': 0.1,
         'gain_k': 2.0,
     }
@@ -249,7 +249,7 @@ def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
     caplog.clear()
     Estimator(Settings(gains='constant', **asked)).reset()
     assert [message.partition(';')[0] for message in caplog.messages] == [
-        'No effect on constant gains: linear_scale_stddev, calibration_drift, '
+        'No effect on constant gains: linear_bias_stddev, calibration_drift, '
         'landmark_velocity_stddev',
     ]
 
@@ -524,9 +524,9 @@ def test_a_velocity_without_covariance_has_what_the_settings_say_of_one_message(
 
 
 def test_the_covariance_of_a_velocity_is_calibrated_as_the_velocity_is():
-    settings = {'linear_scale_stddev': (0.1, 0.0, 0.0), 'angular_bias_stddev': (0.0, 0.0, 0.2)}
+    settings = {'linear_scale_stddev': (0.1, 0.0, 0.0), 'linear_bias_stddev': (0.0, 0.2, 0.0)}
     covariance, speed = np.diag(np.full(6, 0.01)), np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0])
     events = [stated(0.1 * k, speed, covariance) for k in range(5)]
     estimator = run(events, reorder_window=0.0, **settings)
-    variances = np.diag(estimator.body_velocity_covariance)[2:5]
-    assert_allclose(variances, [0.01 + 0.2**2, 0.01 + (0.1 * 3.0) ** 2, 0.01])
+    variances = np.diag(estimator.body_velocity_covariance)[3:]
+    assert_allclose(variances, [0.01 + (0.1 * 3.0) ** 2, 0.01 + 0.2**2, 0.01])

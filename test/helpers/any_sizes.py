@@ -16,6 +16,7 @@ STDDEVS = {
     'angular_scale_stddev': (0.02,) * 3,
     'linear_scale_stddev': (0.02,) * 3,
     'angular_bias_stddev': (0.01,) * 3,
+    'linear_bias_stddev': (0.01,) * 3,
     'sensor_rotation_stddev': (0.03,) * 3,
     'sensor_translation_stddev': (0.05,) * 3,
     'velocity_delay_stddev': 0.2,

@@ -91,10 +91,10 @@ class TestWithoutIds:
 
     def test_a_start_may_be_known_but_for_the_heading(self):
         world = World(0, is_planar=True)
-        pose = (*world.start[:3, 3].tolist(), 0.0, 0.0, 0.0)
-        given = {'set_initial_pose': True, 'initial_pose': pose, 'initial_pose_stddev': (0.0, 2.0)}
-        estimator = Estimator(world.settings(**given))
-        estimator.load_map(world.map())
+        pose, turn = np.eye(4), np.diag([0.0, 0.0, 2.0**2, 0.0, 0.0, 0.0])
+        pose[:3, 3] = world.start[:3, 3]
+        estimator = Estimator(world.settings())
+        estimator.load_map(world.map(), pose, turn)
         add(estimator, [without_ids(event) for event in world.drive(0.0, 3.0, count=8)])
         assert estimator.is_localised
         assert np.linalg.norm(world.error(estimator, 2.9)) < 0.3

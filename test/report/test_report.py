@@ -85,7 +85,7 @@ def test_what_is_estimated_of_a_sensor_begins_where_it_is_heard(slam_observer, t
         for number, event in enumerate(events()):
             if number > MESSAGE_COUNT or not isinstance(event, ObservationEvent):
                 writer.write_event(event)
-    settings = ('linear_scale_stddev=[0.01,0,0]', 'sensor_rotation_stddev=[0,0,0.1]')
+    settings = ('linear_bias_stddev=[0.01,0,0]', 'sensor_rotation_stddev=[0,0,0.1]')
     options = [word for setting in settings for word in ('--set', setting)]
     slam_observer.succeed('replay', recording, *options, '--report', report)
     numbers = numbers_of(report)
@@ -94,8 +94,8 @@ def test_what_is_estimated_of_a_sensor_begins_where_it_is_heard(slam_observer, t
         assert len(part['t']) == len(part['value']) == len(part['deviation'])
         assert part['t'][-1] == numbers['errors']['t'][-1]
         begins[part['name'].partition('/')[0]] = part['t'][0]
-    assert begins['linear_scale_x'] == numbers['errors']['t'][0]
-    assert begins['sensor_rotation_z'] > begins['linear_scale_x']
+    assert begins['linear_bias_x'] == numbers['errors']['t'][0]
+    assert begins['sensor_rotation_z'] > begins['linear_bias_x']
 
 
 def test_settings_that_differ_are_listed(slam_observer, tmp_path):
