@@ -94,8 +94,6 @@ class Job:
         return f'{self.recording.stem}-{self.run_id}'
 
 
-Failure = dict[str, object]
-
 REPORTS, TRAJECTORIES = 'reports', 'trajectories'  # folders of ``--out`` for files of the runs
 
 
@@ -183,7 +181,7 @@ def run(args: argparse.Namespace) -> None:
         parts = zip(recordings, part_of(recordings, len(points), args.shard), strict=True)
         parts_of_shard = {recording: part for recording, part in parts if part}
         hashes: dict[Path, str] = {}
-        failures: list[Failure] = []
+        failures: list[dict[str, object]] = []
         of_files = Pool(futures.ThreadPoolExecutor, args.workers)
         if args.scheduler is not None:
             of_files = cluster_pool(args.scheduler, len(parts_of_shard))
@@ -263,7 +261,7 @@ def _make_folders(args: argparse.Namespace) -> None:
         destination(args.out / file)
 
 
-def _failed(recording: Path, reason: str, job: Job | None = None) -> Failure:
+def _failed(recording: Path, reason: str, job: Job | None = None) -> dict[str, object]:
     logger.warning('%s failed: %s', recording, reason)
     run = {} if job is None else {'run': job.run_id, 'grid': job.point}
     return {'recording': str(recording), 'error': reason, **run}

@@ -19,7 +19,6 @@ from slam_observer_ros.cli.console import print_columns, print_json, print_table
 from slam_observer_ros.cli.options import (
     add_input_options,
     add_settings_options,
-    check_inputs_are_kept,
     check_outputs,
     FORCE,
     Given,
@@ -123,8 +122,7 @@ def run(args: argparse.Namespace) -> None:
         survey = read_map(args.survey)
         if request.settings.localization_mode == 'off':
             request = request.with_values({'localization_mode': 'uncertain'})
-    check_inputs_are_kept({'--out': args.out}, read)
-    check_outputs([args.out], args.force)
+    check_outputs({'--out': args.out}, args.force, read)
     # What is held out is only looked at, before the long search.
     with muted_warnings():  # they are shown when it is judged
         hashes = [read_material(request, path, 1.0, survey).sha256 for path in args.hold_out]

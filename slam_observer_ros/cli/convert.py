@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.options import check_inputs_are_kept, check_outputs, FORCE, options
+from slam_observer_ros.cli.options import check_outputs, FORCE, options
 from slam_observer_ros.common.errors import failing, OutputError
 from slam_observer_ros.common.files import unfinished_file
 from slam_observer_ros.common.findings import found
@@ -116,8 +116,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def _run_tum(args: argparse.Namespace) -> None:
     """Write the poses of a topic."""
     read = {f'the recording {args.file}': files_of(args.file)}
-    check_inputs_are_kept({'OUT.tum': args.output}, read)
-    check_outputs([args.output], args.force)
+    check_outputs({'OUT.tum': args.output}, args.force, read)
     with Recording(args.file) as recording:
         topic = pose_topic(recording.topics, args.topic)
         trajectory = recording.trajectory(topic, args.base_frame or '')
@@ -143,8 +142,7 @@ def _run(args: argparse.Namespace) -> None:
     read = [file for file in given if file is not None]
     beside = None if args.write_beside is None else args.output.with_suffix('.yaml')
     outputs = {'OUT.mcap': args.output, 'the file beside it': beside}
-    check_inputs_are_kept(outputs, {'the data set': read})
-    check_outputs(outputs.values(), args.force)
+    check_outputs(outputs, args.force, {'the data set': read})
     data_set: DataSet = args.load(args)
     write_data_set(data_set, args.output, args.force)
     rows = {

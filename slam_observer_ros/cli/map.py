@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.options import check_inputs_are_kept, check_outputs, FORCE, options
+from slam_observer_ros.cli.options import check_outputs, FORCE, options
 from slam_observer_ros.lie.axes import axes_of
 from slam_observer_ros.mapping.finder import look_around
 from slam_observer_ros.mapping.map_alignment import place_for_another, symmetries
@@ -98,8 +98,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _convert(args: argparse.Namespace) -> None:
-    check_inputs_are_kept({'OUT.yaml': args.output}, {'what is converted': [args.file]})
-    check_outputs([args.output], args.force)
+    check_outputs({'OUT.yaml': args.output}, args.force, {'what is converted': [args.file]})
     landmark_map = import_map(
         args.file, args.frame, args.sigma, args.orientation_sigma, args.tag_axes, args.unit
     )
@@ -115,8 +114,7 @@ def _convert(args: argparse.Namespace) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    check_inputs_are_kept({'--plot': args.plot}, {'the map': [args.file]})
-    check_outputs([args.plot], args.force)
+    check_outputs({'--plot': args.plot}, args.force, {'the map': [args.file]})
     known, settings = read_map(args.file), Settings()
     known = known if args.space else known.flattened()
     looks = look_around(

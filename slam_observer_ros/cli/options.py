@@ -357,10 +357,22 @@ def recording_path(text: str) -> Path:
     return path
 
 
-def check_outputs(files: Iterable[Path | None], force: bool) -> None:
-    """Raise a UsageError if a file can't be written, or not without ``force``; None is none."""
-    wanted = [file for file in files if file is not None]
-    for number, file in enumerate(wanted):
+def check_outputs(
+    outputs: Mapping[str, Path | None],
+    force: bool,
+    read: Mapping[str, Iterable[Path]] = MappingProxyType({}),
+) -> None:
+    """Raise a UsageError if an output can't be written, not without ``force``, or replaces input.
+
+    Outputs are by option, None where not asked for; files that are ``read`` by what they are.
+    """
+    kept = {os.path.realpath(f): what for what, files in read.items() for f in files}
+    wanted = {option: file for option, file in outputs.items() if file is not None}
+    for option, file in wanted.items():
+        if (what := kept.get(os.path.realpath(file))) is not None:
+            raise UsageError(f'{option} {file} would replace {what}; give another name')
+    others: list[Path] = []
+    for file in wanted.values():
         if file.is_dir():
             raise UsageError(f'{file} is a directory; give the name of a file')
         real = Path(os.path.realpath(file))  # which fails in no circle of links
@@ -370,25 +382,10 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
             raise UsageError(f'{file} is there, and no regular file; give another name')
         if file.exists() and not force:
             raise UsageError(f'{file} exists already; give another name, or --force to replace it')
-        if not file.parent.is_dir():
-            raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
-        if not os.access(file.parent, os.W_OK):
-            raise UsageError(f'{file}: nothing may be written to {file.parent}')
-        if real in [Path(os.path.realpath(other)) for other in wanted[:number]]:
+        _check_parent(file)
+        if real in others:
             raise UsageError(f'{file} is named for two outputs')
-
-
-def check_inputs_are_kept(
-    outputs: Mapping[str, Path | None], inputs: Mapping[str, Iterable[Path]]
-) -> None:
-    """Raise a UsageError if an output would replace a file which is read, by whatever name.
-
-    Outputs are by option, None where not asked for; inputs by what they are.
-    """
-    read = {os.path.realpath(file): what for what, files in inputs.items() for file in files}
-    for option, file in outputs.items():
-        if file is not None and (what := read.get(os.path.realpath(file))) is not None:
-            raise UsageError(f'{option} {file} would replace {what}; give another name')
+        others.append(real)
 
 
 def check_directory(directory: Path) -> None:
@@ -397,10 +394,14 @@ def check_directory(directory: Path) -> None:
         return
     if os.path.lexists(directory):
         raise UsageError(f'{directory} is no directory; give the name of one')
-    if not directory.parent.is_dir():
-        raise UsageError(f'{directory}: there is no directory {directory.parent}; make it first')
-    if not os.access(directory.parent, os.W_OK):
-        raise UsageError(f'{directory}: nothing may be written to {directory.parent}')
+    _check_parent(directory)
+
+
+def _check_parent(path: Path) -> None:
+    if not path.parent.is_dir():
+        raise UsageError(f'{path}: there is no directory {path.parent}; make it first')
+    if not os.access(path.parent, os.W_OK):
+        raise UsageError(f'{path}: nothing may be written to {path.parent}')
 
 
 def parse_value(text: str) -> object:

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 import logging
 import math
+import os
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_columns, print_json, print_table, show_progress
 from slam_observer_ros.cli.options import (
     add_run_options,
     add_settings_options,
-    check_inputs_are_kept,
     check_outputs,
     FORCE,
     options,
@@ -140,11 +140,12 @@ def _check_files(args: argparse.Namespace, config: Path | None) -> None:
     read = {f'the recording {args.recording}': files_of(args.recording)}
     if config is not None:
         read['the file of --config'] = [config]
-    loaded = {} if args.load_map is None else {'the file of --load-map': map_files(args.load_map)}
-    files = {'--tum': args.tum, '--report': args.report, '--mcap': args.mcap}
-    check_inputs_are_kept(files, read | loaded)
-    check_inputs_are_kept({'--map': args.map}, read)
-    check_outputs([args.map, *files.values()], args.force)
+    if args.load_map is not None:
+        updated = None if args.map is None else os.path.realpath(args.map)
+        loaded = [f for f in map_files(args.load_map) if os.path.realpath(f) != updated]
+        read['the file of --load-map'] = loaded
+    files = {'--map': args.map, '--tum': args.tum, '--report': args.report, '--mcap': args.mcap}
+    check_outputs(files, args.force, read)
 
 
 def _write_map(result: Result, path: Path) -> None:

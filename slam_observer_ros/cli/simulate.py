@@ -179,7 +179,7 @@ def run(args: argparse.Namespace) -> None:
         velocity_timeout=max(2.0 * args.step, Settings().velocity_timeout),
         max_innovation_time=max(args.step, Settings().max_innovation_time),
     )
-    check_outputs([args.output], args.force)
+    check_outputs({'--output': args.output}, args.force)
     figures = {name: f'{name}.{args.plot_format}' for name in FIGURES}
     if args.plot is not None:
         check_directory(args.plot)
@@ -187,7 +187,7 @@ def run(args: argparse.Namespace) -> None:
         if args.output is not None and os.path.realpath(args.output) in written:
             raise UsageError(f'{args.output} is named for two outputs')
         if args.plot.is_dir():
-            check_outputs([args.plot / name for name in figures.values()], args.force)
+            check_outputs({name: args.plot / name for name in figures.values()}, args.force)
     simulation = Simulation(scenario, START_NS)
     result = run_simulation(simulation, _events(simulation, 'simulating'), settings)
     if args.output is not None:

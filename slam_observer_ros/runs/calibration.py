@@ -575,17 +575,6 @@ DIGITS = 3  # significant digits of a noise figure; it is seldom known to so man
 Objective = Callable[[FloatArray], float]
 
 
-class LikelyFactors(NamedTuple):
-    """Logarithms of the most likely factors, and their deviations.
-
-    These are by the curvature of the log likelihood, where all others are unknown, too; infinite
-    where it has no maximum there.
-    """
-
-    logs: FloatArray  # (n,)
-    deviations: FloatArray  # (n,)
-
-
 @dataclass(frozen=True, slots=True)
 class NoiseFactor:
     """By which factor the noise of a kind is another than stated: its logarithm, ± so much."""
@@ -610,10 +599,14 @@ def without_effect(objective: Objective, n: int) -> list[int]:
     return [i for i, change in enumerate(changes) if np.max(np.abs(change)) < NO_EFFECT]
 
 
-def most_likely(objective: Objective, n: int) -> LikelyFactors:
-    """Return the maximum of a log likelihood over the logarithms of n factors, from 1 on."""
+def most_likely(objective: Objective, n: int) -> tuple[FloatArray, FloatArray]:
+    """Return logarithms (n,) of the most likely factors, from 1 on, and their deviations (n,).
+
+    These are by the curvature of the log likelihood, where all others are unknown, too; infinite
+    where it has no maximum there.
+    """
     if not n:
-        return LikelyFactors(np.zeros(0), np.zeros(0))
+        return np.zeros(0), np.zeros(0)
     simplex = np.vstack([np.zeros(n), FIRST_STEP * np.eye(n)])
     result = optimize.minimize(
         lambda x: -objective(x),
@@ -645,7 +638,7 @@ def most_likely(objective: Objective, n: int) -> LikelyFactors:
             deviations[curved] = np.sqrt(np.diagonal(np.linalg.inv(part)))
             break
         curved = np.delete(curved, np.argmax(np.abs(vectors[:, 0])))
-    return LikelyFactors(x, deviations)
+    return x, deviations
 
 
 def remembered(objective: Callable[[Sequence[float]], float]) -> Objective:
@@ -678,8 +671,8 @@ def search_noise(
     idle = without_effect(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
     effective = [kind for number, kind in enumerate(kinds) if number not in idle]
     found = most_likely(remembered(lambda x: log_likelihood(effective, x)), len(effective))
-    factors = zip(effective, found.logs.tolist(), found.deviations.tolist(), strict=True)
-    return [NoiseFactor(*each) for each in factors]
+    logs, deviations = (values.tolist() for values in found)
+    return [NoiseFactor(*each) for each in zip(effective, logs, deviations, strict=True)]
 
 
 def rounded(value: Value) -> Value:

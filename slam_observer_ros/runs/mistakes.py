@@ -199,7 +199,14 @@ def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
 
 def in_blocks(events: Iterable[Event]) -> Iterator[Event | VelocityBlock]:
     """Yield events with the velocities that follow each other in blocks, which take less time."""
-    for alike, group in groupby(events, key=_of_a_block):
+
+    def alike_in(event: Event) -> tuple[bool, bool, bool] | None:
+        """Return what velocities of a block have in common; None for what is no velocity."""
+        if not isinstance(event, VelocityEvent):
+            return None
+        return event.is_mean, event.covariance is None, event.receive_ns is None
+
+    for alike, group in groupby(events, key=alike_in):
         if alike is None:
             yield from group
             continue
@@ -213,13 +220,6 @@ def in_blocks(events: Iterable[Event]) -> Iterator[Event | VelocityBlock]:
             np.array(received) if received else None,
             is_mean=velocities[0].is_mean,
         )
-
-
-def _of_a_block(event: Event) -> tuple[bool, bool, bool] | None:
-    """Return what velocities of a block have in common; None for what is no velocity."""
-    if not isinstance(event, VelocityEvent):
-        return None
-    return event.is_mean, event.covariance is None, event.receive_ns is None
 
 
 class Drive:

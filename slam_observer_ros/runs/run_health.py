@@ -310,34 +310,25 @@ def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int,
 
 
 def _of_growth(result: Result, errors: TrajectoryErrors) -> Iterator[Finding]:
-    seconds, errors_m = result.seconds(errors.estimate.stamps_ns), errors.distances_m
+    stamps_ns, seen = errors.estimate.stamps_ns, result.innovations
+    seconds, errors_m, is_used = result.seconds(stamps_ns), errors.distances_m, seen.weights > 0.0
     for start, end in growth_windows(seconds, errors_m):
         times_s: dict[str, Any] = {'start_s': float(seconds[start]), 'end_s': float(seconds[end])}
         bounds_m = {'before_m': errors_m[start], 'after_m': errors_m[end]}
-        circumstances = _circumstances(result, errors, start, end)
+        # What was seen, and how the robot moved, meanwhile
+        poses, (first_ns, last_ns) = errors.truth.poses[start : end + 1], stamps_ns[[start, end]]
+        during = (seen.stamps_ns >= first_ns) & (seen.stamps_ns <= last_ns)
+        used, gated = (int(np.count_nonzero(during & is_so)) for is_so in (is_used, ~is_used))
+        driven_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+        turns = so3.log(poses[1:, :3, :3] @ poses[:-1, :3, :3].swapaxes(-1, -2))
+        turned_deg = np.degrees(np.linalg.norm(turns, axis=1).sum())
+        what = f'{used} observations of landmarks were used' if used else 'no landmark was used'
+        circumstances = (
+            f'{what}{_blind(result, *times_s.values())}{f", {gated} rejected" if gated else ""}, '
+            f'while the robot drove {driven_m:.1f} m and turned by {turned_deg:.0f}°'
+        )
         finding = found('error_growth', circumstances=circumstances, **bounds_m, **times_s)
         yield replace(finding, **times_s)
-
-
-def _circumstances(result: Result, errors: TrajectoryErrors, start: int, end: int) -> str:
-    """Say what was seen, and how the robot moved, from one row of the errors to another."""
-    poses = errors.truth.poses[start : end + 1]
-    stamps_ns = errors.estimate.stamps_ns[[start, end]]
-    innovations = result.innovations
-    during = (innovations.stamps_ns >= stamps_ns[0]) & (innovations.stamps_ns <= stamps_ns[1])
-    used = int(np.count_nonzero(during & (innovations.weights > 0.0)))
-    gated = int(np.count_nonzero(during & (innovations.weights == 0.0)))
-    bounds_s = result.seconds(stamps_ns)
-    driven_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
-    turns = so3.log(poses[1:, :3, :3] @ poses[:-1, :3, :3].swapaxes(-1, -2))
-    turned_deg = np.degrees(np.linalg.norm(turns, axis=1).sum())
-    seen = f'{used} observations of landmarks were used' if used else 'no landmark was used'
-    blind = _blind(result, *bounds_s.tolist())
-    rejected = f', {gated} rejected' if gated else ''
-    return (
-        f'{seen}{blind}{rejected}, while the robot drove {driven_m:.1f} m and turned '
-        f'by {turned_deg:.0f}°'
-    )
 
 
 def _blind(result: Result, start_s: float, end_s: float) -> str:
