@@ -38,40 +38,24 @@ class _Counted(Enum):
 class Reason(_Counted):
     """Why a point that was observed is not used: each such point has exactly one reason."""
 
-    REJECTED = (
-        'rejected_landmark',
-        'rejected',
-        'see by how much with replay --explain ID, and look at signs, units, frames and noise',
-    )
+    # fmt: off
+    REJECTED = ('rejected_landmark', 'rejected', 'see by how much with replay --explain ID, and '
+                'look at signs, units, frames and noise')
     NO_ID = 'unknown_id', 'without id', 'let the sensor give ids, or set gains: riccati'
     REPEATED_ID = 'repeated_id', 'of a repeated id', 'give each landmark an id of its own'
     RESERVED_ID = 'reserved_id', 'of a reserved id', 'give these landmarks other ids'
     SURPLUS = 'surplus_point', 'more than max_points', 'let the sensor send fewer points'
-    IMPOSSIBLE_ID = (
-        'impossible_id',
-        'of an impossible id',
-        'look at what the driver writes there; -1 is a point without id',
-    )
-    BAD = (
-        'bad_point',
-        'with NaN in what is stated of them',
-        'let the driver state numbers; all zeros mean that a covariance is unknown',
-    )
-    UNMAPPED = (
-        'unmapped_landmark',
-        'not mapped',
-        'load the map of this place, or set max_landmarks higher',
-    )
-    WAITING = (
-        'waiting_point',
-        'half points of landmarks that are not known yet',
-        'drive a curve: they enter once one place fits',
-    )
-    CARRIED = (
-        'carried_point',
-        'of landmarks that move with the robot',
-        'do nothing if the robot carries them; where they stay behind they are used again',
-    )
+    IMPOSSIBLE_ID = ('impossible_id', 'of an impossible id', 'look at what the driver writes '
+                     'there; -1 is a point without id')
+    BAD = ('bad_point', 'with NaN in what is stated of them', 'let the driver state numbers; all '
+           'zeros mean that a covariance is unknown')
+    UNMAPPED = ('unmapped_landmark', 'not mapped', 'load the map of this place, or set '
+                'max_landmarks higher')
+    WAITING = ('waiting_point', 'half points of landmarks that are not known yet', 'drive a '
+               'curve: they enter once one place fits')
+    CARRIED = ('carried_point', 'of landmarks that move with the robot', 'do nothing if the robot '
+               'carries them; where they stay behind they are used again')
+    # fmt: on
 
 
 class Change(_Counted):

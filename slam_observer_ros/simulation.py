@@ -114,9 +114,11 @@ class Simulation:
     def __init__(self, scenario: Scenario, start_ns: int = 0) -> None:
         self.scenario = scenario
         self.start_ns = start_ns
-        world_rng, self._noise_seed = _split_seed(scenario.seed)
-        self._rest_points = _landmark_field(scenario, world_rng)
-        count = len(self._rest_points)
+        # The noise has a seed of its own: no option of it moves landmarks.
+        world_seed, self._noise_seed = np.random.SeedSequence(scenario.seed).spawn(2)
+        world_rng, count = np.random.default_rng(world_seed), scenario.landmark_count
+        directions = _random_directions(count, world_rng) if count else np.array(PAPER_DIRECTIONS)
+        self._rest_points, count = scenario.landmark_distance * directions, len(directions)
         self.landmark_ids: IntArray = np.arange(count, dtype=np.int64)
         self._bias = scenario.initial_bias * _random_directions(count, world_rng)
         self._phases = world_rng.uniform(0.0, 2.0 * np.pi, count)
@@ -177,7 +179,9 @@ class Simulation:
                 if kind == 'velocity'
                 else self._observation(stamp_ns, rng, is_new)
             )
-            yield Delivery(stamp_ns + self._draw_delay_ns(rng), number, event)
+            is_late = rng.random() < self.scenario.late_fraction
+            delay_ns = to_ns(rng.uniform(0.0, self.scenario.max_lateness)) if is_late else 0
+            yield Delivery(stamp_ns + delay_ns, number, event)
 
     def _schedule(self) -> Iterator[tuple[int, str]]:
         """Yield (stamp, kind) in stamp order."""
@@ -230,11 +234,6 @@ class Simulation:
         )
         return is_seen
 
-    def _draw_delay_ns(self, rng: np.random.Generator) -> int:
-        if rng.random() >= self.scenario.late_fraction:
-            return 0
-        return to_ns(rng.uniform(0.0, self.scenario.max_lateness))
-
     def _loop_angle(self, stamp_ns: int) -> FloatArray:
         rate = self.scenario.landmark_speed / LANDMARK_LOOP_RADIUS_M
         angle: FloatArray = self._phases + rate * self._elapsed_s(stamp_ns)
@@ -242,18 +241,6 @@ class Simulation:
 
     def _elapsed_s(self, stamp_ns: int | IntArray) -> FloatArray:
         return to_s(np.asarray(stamp_ns, dtype=np.int64) - self.start_ns)
-
-
-def _split_seed(seed: int) -> tuple[np.random.Generator, np.random.SeedSequence]:
-    """Return the world's generator and the noise's seed: noise options don't move landmarks."""
-    world_seed, noise_seed = np.random.SeedSequence(seed).spawn(2)
-    return np.random.default_rng(world_seed), noise_seed
-
-
-def _landmark_field(scenario: Scenario, rng: np.random.Generator) -> FloatArray:
-    if scenario.landmark_count == 0:
-        return scenario.landmark_distance * np.asarray(PAPER_DIRECTIONS)
-    return scenario.landmark_distance * _random_directions(scenario.landmark_count, rng)
 
 
 def _random_directions(count: int, rng: np.random.Generator) -> FloatArray:

@@ -22,12 +22,35 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
-    """What is wrong, with names in braces for figures, how bad it is, and what to do."""
+class Finding:
+    """Something that is, or may be, wrong: what, how bad, since when, and what to do.
 
+    It is of the time from ``start_s`` to ``end_s``, seconds since the run's first event; None
+    where it is of the whole run, or goes on.
+    """
+
+    kind: str
     level: Level
     what: str
     remedy: str
+    start_s: float | None = None
+    end_s: float | None = None
+
+    def __str__(self) -> str:
+        return self.text()
+
+    def text(self, note: str = '') -> str:
+        """Return it as a sentence, with a note behind what is wrong."""
+        what = self.what
+        if not KINDS[self.kind].what.startswith('{'):  # with a name as it is
+            what = what[:1].upper() + what[1:]
+        joint = '; ' if ': ' in what else ': '
+        end = '' if self.remedy.endswith(('?', '.')) else '.'
+        return f'{what}{note}{joint}{self.remedy}{end}'
+
+    def as_json(self) -> dict[str, object]:
+        """Return its parts as ``--json`` has them."""
+        return asdict(self) | {'level': self.level.name.lower()}
 
 
 NOISE = 'state more noise (Tune the noise)'
@@ -308,16 +331,19 @@ MISTAKES = frozenset({
 })  # fmt: skip
 """Kinds of finding that name a mistake of the set-up."""
 
-_NOTES = frozenset({
+_NOTES = (
     'axis_noise', 'motion_noise', 'point_noise', 'large_noise', 'error_growth',
     'overconfident_pose', 'side_undecided',
-})  # fmt: skip
+)  # fmt: skip
 _ERRORS = MISTAKES | {'unused_input', 'contradicted_pose', 'diverged'}
+_LEVELS = dict.fromkeys(_NOTES, Level.NOTE) | dict.fromkeys(_ERRORS, Level.ERROR)
 
 KINDS = {
-    kind: Kind(Level.ERROR if kind in _ERRORS else Level(kind not in _NOTES), *text.split(' → '))
+    kind: Finding(kind, _LEVELS.get(kind, Level.WARNING), what, remedy)
     for kind, text in _TEXTS.items()
+    for what, remedy in [text.split(' → ')]
 }
+"""Each kind of finding, with names in braces for its figures."""
 
 FAULTS = {
     # The inputs of a node
@@ -359,44 +385,11 @@ FAULTS = {
 """What inputs, clocks and transforms of a node have, and what to do about it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Something that is, or may be, wrong: what, how bad, since when, and what to do.
-
-    It is of the time from ``start_s`` to ``end_s``, seconds since the run's first event; None
-    where it is of the whole run, or goes on.
-    """
-
-    kind: str
-    level: Level
-    what: str
-    remedy: str
-    start_s: float | None = None
-    end_s: float | None = None
-
-    def __str__(self) -> str:
-        return self.text()
-
-    def text(self, note: str = '') -> str:
-        """Return it as a sentence, with a note behind what is wrong."""
-        what = self.what
-        if not KINDS[self.kind].what.startswith('{'):  # with a name as it is
-            what = what[:1].upper() + what[1:]
-        joint = '; ' if ': ' in what else ': '
-        end = '' if self.remedy.endswith(('?', '.')) else '.'
-        return f'{what}{note}{joint}{self.remedy}{end}'
-
-    def as_json(self) -> dict[str, object]:
-        """Return its parts as ``--json`` has them."""
-        return asdict(self) | {'level': self.level.name.lower()}
-
-
 def found(kind: str, /, **figures: object) -> Finding:
     """Return a finding of a kind, with its figures in words."""
     stated = KINDS[kind]
-    return Finding(
-        kind, stated.level, stated.what.format(**figures), stated.remedy.format(**figures)
-    )
+    texts = (stated.what.format(**figures), stated.remedy.format(**figures))
+    return Finding(kind, stated.level, *texts)
 
 
 def fault(kind: str, /, **figures: object) -> str:
