@@ -230,8 +230,7 @@ class Found:
         }
 
 
-TRANSLATION = (0.1,) * 3
-"""How far from where it is stated a sensor may be mounted, metres."""
+TRANSLATION = (0.1,) * 3  # how far from where it is stated a sensor may be mounted, metres
 
 SCALE, RANGE_BIAS_M, BIAS, DELAY_S = 0.1, 0.2, 0.02, 0.3
 """How far scales, of ranges and velocities, all ranges from one landmark, a gyroscope's zero

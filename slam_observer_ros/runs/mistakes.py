@@ -160,8 +160,7 @@ PAIRS = tuple(
     if one.goes_with(other)
 )
 
-ROTATION = (0.1,) * 3
-"""How far a sensor may be turned against what is stated, rad."""
+ROTATION = (0.1,) * 3  # how far a sensor may be turned against what is stated, rad
 
 USUALLY_TURNED = 0.035
 """How far brackets are turned as a rule, rad: settings state so, where it matters."""
@@ -336,7 +335,7 @@ class Search:
             max_hypotheses=1,
             relinearization_interval=0,
         )
-        self._steps = (_mount if of_mount_only else _named)(trial, events, known)
+        self._steps = _named(trial, events, known, of_mount_only)
 
     def advance(self, seconds: float) -> bool:
         """Go on for some time; return whether the end is reached, and ``findings`` are known."""
@@ -356,14 +355,16 @@ Steps: TypeAlias = Generator[None, None, T]
 
 
 def _named(
-    settings: Settings, recorded: Iterable[Event], known: Maps | None
+    settings: Settings, recorded: Iterable[Event], known: Maps | None, of_mount_only: bool
 ) -> Steps[list[Finding]]:
+    if of_mount_only:
+        return (yield from _Trial(settings, first_drive(recorded), known).mount())
     longer = first_drive(recorded, LONGER)
-    events = first_drive(longer)
-    findings = yield from _judged(settings, events, EARLY, known, len(longer) == len(events))
+    trial = _Trial(settings, first_drive(longer), known)
+    findings = yield from trial.named(EARLY, len(longer) == len(trial.events))
     if findings is None:
-        findings = yield from _judged(settings, longer, LONGER * EARLY, known, is_all=True)
-    return findings or (yield from _mount(settings, events, known))
+        findings = yield from _Trial(settings, longer, known).named(LONGER * EARLY, is_all=True)
+    return findings or (yield from trial.mount())
 
 
 def leaves_mount_open(settings: Settings) -> bool:
@@ -372,142 +373,181 @@ def leaves_mount_open(settings: Settings) -> bool:
     return not np.array(settings.sensor_rotation_stddev)[turned].all()
 
 
-def _mount(
-    settings: Settings, recorded: Iterable[Event], known: Maps | None
-) -> Steps[list[Finding]]:
-    """Return how a sensor is turned against what is stated, by more than brackets are as a rule.
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """What corrections are tried on: a drive, and how a filter takes it."""
 
-    If points are likelier where that is estimated.
-    """
-    events = first_drive(recorded)
-    if not any(len(each.ids) for each in events if isinstance(each, ObservationEvent)):
-        return []
-    open_mount = Correction('', changes={'sensor_rotation_stddev': ROTATION})
-    turned = yield from _score(settings, events, open_mount, known)
-    findings = of_mounting(turned.calibration, 'mount_off', USUALLY_TURNED)
-    findings = [each for each in findings if each.kind == 'mount_off']  # no scale of ranges
-    if findings:
-        before = yield from _score(settings, events, AS_IT_IS, known)
-        count = min(turned.likelihood.count, before.likelihood.count)
-        findings = findings if count * (turned.mean - before.mean) > LIKELIER else []
-    return findings
+    settings: Settings
+    events: Sequence[Event]
+    known: Maps | None
 
+    def sees_any(self) -> bool:
+        """Return whether there are points at all."""
+        return any(len(each.ids) for each in self.events if isinstance(each, ObservationEvent))
 
-def _judged(
-    settings: Settings, events: Sequence[Event], early: float, known: Maps | None, is_all: bool
-) -> Steps[list[Finding] | None]:
-    """Return the mistakes that explain events; None if more events, unless it is all, may do so.
+    def mount(self) -> Steps[list[Finding]]:
+        """Return how a sensor is turned against what is stated, by more than brackets usually are.
 
-    By an ``early`` part of the drive is chosen what is tried on the whole.
-    """
-    if not any(len(each.ids) for each in events if isinstance(each, ObservationEvent)):
-        return []
-    is_silent = never_turns(events)
-    if is_silent:  # how it turns is for the points to say
-        settings = replace(settings, angular_velocity_noise=(UNKNOWN_TURN,) * 3)
-    before = yield from _score(settings, events, AS_IT_IS, known)
-    singles = CORRECTIONS if known is None else IN_MAP
-    if is_silent:
-        singles = tuple(each for each in singles if each.turn == 1.0)
-    best, is_open = yield from _best(settings, events, early, before, singles, known)
-    if is_open and not is_all:
-        return None
-    if best is before or best.mean - before.mean < WEAK:
-        # As with points in millimetres and in a camera's axes, where no single one helps much.
-        pair, _ = yield from _best(settings, events, early, before, PAIRS, known)
-        best = pair if pair.is_clearly_better(best) else best
-    silent = []
-    if is_silent and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
-        silent = [found('no_turning')]
-    parts = best.correction.parts
-    if best is not before and not parts:
-        first = best.correction
-        parts = (first,)
-        if not silent:
-            corrected, settings = list(first.apply(events)), replace(settings, **first.changes)
-            before = yield from _score(settings, corrected, AS_IT_IS, known)
-            others = [each for each in CORRECTIONS if first.goes_with(each)]
-            second, _ = yield from _best(settings, corrected, early, before, others, known)
-            if second is not before:
-                parts = (first, second.correction)
-    return silent + _findings(parts, known)
+        If points are likelier where that is estimated.
+        """
+        if not self.sees_any():
+            return []
+        open_mount = Correction('', changes={'sensor_rotation_stddev': ROTATION})
+        turned = yield from self.score(open_mount)
+        findings = of_mounting(turned.calibration, 'mount_off', USUALLY_TURNED)
+        findings = [each for each in findings if each.kind == 'mount_off']  # no scale of ranges
+        if findings:
+            before = yield from self.score(AS_IT_IS)
+            count = min(turned.likelihood.count, before.likelihood.count)
+            findings = findings if count * (turned.mean - before.mean) > LIKELIER else []
+        return findings
 
+    def named(self, early: float, is_all: bool) -> Steps[list[Finding] | None]:
+        """Return the mistakes that explain it; None if more events, unless it is all, may do so.
 
-def _best(
-    settings: Settings,
-    events: Sequence[Event],
-    early: float,
-    before: _Score,
-    corrections: Iterable[Correction],
-    known: Maps | None,
-) -> Steps[tuple[_Score, bool]]:
-    """Return how likely points are by the correction that makes them clearly the likeliest.
+        By an ``early`` part of the drive is chosen what is tried on the whole.
+        """
+        if not self.sees_any():
+            return []
+        trial, singles = self, CORRECTIONS if self.known is None else IN_MAP
+        is_silent = never_turns(self.events)
+        if is_silent:  # how it turns is for the points to say
+            unknown = replace(self.settings, angular_velocity_noise=(UNKNOWN_TURN,) * 3)
+            trial = replace(self, settings=unknown)
+            singles = tuple(each for each in singles if each.turn == 1.0)
+        before = yield from trial.score(AS_IT_IS)
+        best, is_open = yield from trial.best(early, before, singles)
+        if is_open and not is_all:
+            return None
+        if best is before or best.mean - before.mean < WEAK:
+            # As with points in millimetres and in a camera's axes, where no single one helps much.
+            pair, _ = yield from trial.best(early, before, PAIRS)
+            best = pair if pair.is_clearly_better(best) else best
+        silent = []
+        if is_silent and min(before.turned_rad, best.turned_rad) > NOTABLE_TURN_RAD:
+            silent = [found('no_turning')]
+        parts = best.correction.parts
+        if best is not before and not parts:
+            first = best.correction
+            parts = (first,)
+            if not silent:
+                changed = replace(trial.settings, **first.changes)
+                trial = replace(trial, settings=changed, events=list(first.apply(self.events)))
+                before = yield from trial.score(AS_IT_IS)
+                others = [each for each in CORRECTIONS if first.goes_with(each)]
+                second, _ = yield from trial.best(early, before, others)
+                if second is not before:
+                    parts = (first, second.correction)
+        return [*silent, *(finding for each in parts for finding in self._findings(each))]
 
-    That is ``before`` where none does, the score of what was recorded. Then some may make them
-    likelier, though not clearly so: whether one does is returned, too.
-    """
-    at_first, tried, is_open = first_drive(events, early), [], False
-    before_at_first = before.until(at_first[-1].stamp_ns)
-    moves = [each.body_velocity for each in events if isinstance(each, VelocityEvent)]
-    may_be = {
-        'turning_in_degrees': Drive(events).turned_rad * IN_DEGREES > LEAST_TURN_RAD,
-        # In the plane ways that go out of it are too long for what is seen.
-        'tag_size': is_flat(np.reshape(moves, (-1, 6))) or not settings.two_d_mode,
-    }
-    for each in corrections:
-        if all(may_be.get(part.kind, True) for part in each.parts or (each,)):
-            score = yield from _score(settings, at_first, each, known, before)
-            if not score.is_hopeless and not before_at_first.is_clearly_better(score):
-                tried.append(score)
-    tried.sort(key=lambda score: score.mean)
-    best = before
-    tried = tried[-TRIED:]
-    if any(each.correction.changes for each in tried):
-        as_sized = yield from _score(settings, events, AS_SIZED, known)
-    for each in [score.correction for score in tried]:
-        score = yield from _score(settings, events, each, known, before)
-        if score.is_hopeless:
-            continue
-        rival = as_sized if each.changes else before
-        is_better = score.is_clearly_better(rival)
-        # In a frame of its own, where no map contradicts it, nothing is compared with the map.
-        is_in_map = known is None or score.localised_share > max(0.0, before.localised_share - 0.1)
-        if is_better and is_in_map and score.mean > best.mean:
-            best = score
-        gain = score.likelihood.count * (score.mean - rival.mean)
-        is_open |= is_in_map and not is_better and gain > LIKELIER
-    if best.correction.kind == 'tag_size':
-        sized = yield from _sized(settings, events, best.correction, known)
-        best = replace(best, correction=sized)
-    return best, is_open and best is before
+    def best(
+        self, early: float, before: _Score, corrections: Iterable[Correction]
+    ) -> Steps[tuple[_Score, bool]]:
+        """Return how likely points are by the correction that makes them clearly the likeliest.
 
+        That is ``before`` where none does, the score of what was recorded. Then some may make them
+        likelier, though not clearly so: whether one does is returned, too.
+        """
+        tried: list[_Score] = []
+        at_first = replace(self, events=first_drive(self.events, early))
+        before_at_first = before.until(at_first.events[-1].stamp_ns)
+        moves = [each.body_velocity for each in self.events if isinstance(each, VelocityEvent)]
+        may_be = {
+            'turning_in_degrees': Drive(self.events).turned_rad * IN_DEGREES > LEAST_TURN_RAD,
+            # In the plane ways that go out of it are too long for what is seen.
+            'tag_size': is_flat(np.reshape(moves, (-1, 6))) or not self.settings.two_d_mode,
+        }
+        for each in corrections:
+            if all(may_be.get(part.kind, True) for part in each.parts or (each,)):
+                score = yield from at_first.score(each, before)
+                if not score.is_hopeless and not before_at_first.is_clearly_better(score):
+                    tried.append(score)
+        tried.sort(key=lambda score: score.mean)
+        best, is_open = before, False
+        chosen = [score.correction for score in tried[-TRIED:]]
+        if any(each.changes for each in chosen):
+            as_sized = yield from self.score(AS_SIZED)
+        for each in chosen:
+            score = yield from self.score(each, before)
+            if score.is_hopeless:
+                continue
+            rival = as_sized if each.changes else before
+            is_better = score.is_clearly_better(rival)
+            # In a frame of its own, where no map contradicts it, nothing is compared with the map.
+            least_share = max(0.0, before.localised_share - 0.1)
+            is_in_map = self.known is None or score.localised_share > least_share
+            if is_better and is_in_map and score.mean > best.mean:
+                best = score
+            gain = score.likelihood.count * (score.mean - rival.mean)
+            is_open |= is_in_map and not is_better and gain > LIKELIER
+        if best.correction.kind == 'tag_size':
+            # The size by what a survey, or else the wheels, makes of ranges
+            rough = best.correction
+            by_wheels = replace(rough, changes={'linear_scale_stddev': (ROUGHLY, 0.0, 0.0)})
+            by_survey = replace(rough, changes=SIZED | {'range_scale_stddev': ROUGHLY})
+            score = yield from self.score(by_wheels if self.known is None else by_survey)
+            found_out = {each.name.partition('/')[0]: each.value for each in score.calibration}
+            factor = 1.0 / found_out.get('linear_scale_x', 1.0)
+            if self.known is not None:
+                factor = found_out.get('range_scale', 1.0)
+            best = replace(best, correction=replace(rough, points=factor * rough.points))
+        return best, is_open and best is before
 
-def _sized(
-    settings: Settings, events: Sequence[Event], rough: Correction, known: Maps | None
-) -> Steps[Correction]:
-    """Return the correction of sizes by what a survey, or else the wheels, makes of ranges."""
-    by_survey = replace(rough, changes=SIZED | {'range_scale_stddev': ROUGHLY})
-    by_wheels = replace(rough, changes={'linear_scale_stddev': (ROUGHLY, 0.0, 0.0)})
-    judged = by_wheels if known is None else by_survey
-    score = yield from _score(settings, events, judged, known)
-    found_out = {each.name.partition('/')[0]: each.value for each in score.calibration}
-    by_range = found_out.get('range_scale', 1.0)
-    factor = 1.0 / found_out.get('linear_scale_x', 1.0) if known is None else by_range
-    return replace(rough, points=factor * rough.points)
+    def _findings(self, correction: Correction) -> list[Finding]:
+        if correction.kind == 'tag_size':
+            by = 'the wheels' if self.known is None else 'the map'
+            return [found('tag_size', factor=correction.scale(), by=by)]
+        # Mirror images are what a map alone sets apart.
+        alike = [kinds for kinds in ALIKE if correction.kind in kinds]
+        alike = [kinds for kinds in alike if self.known is None or kinds != MIRRORED]
+        return [found(kind) for kind in sorted(*alike or [{correction.kind}])]
 
+    def score(self, correction: Correction, rival: _Score | None = None) -> Steps[_Score]:
+        """Run a filter that believes a correction; given up once it is worse than a rival."""
+        settings = replace(self.settings, **correction.changes)
+        k, scale = axes_of(settings.two_d_mode).point, correction.scale()
+        reach = max(
+            float(np.abs(each.points).max(initial=0.0))
+            for each in self.events
+            if isinstance(each, ObservationEvent)
+        )
+        recorder, attitudes = LikelihoodRecorder(k, scale * reach), [np.eye(3)]
+        localised: list[bool] = []
 
-def _findings(corrections: Iterable[Correction], known: Maps | None) -> list[Finding]:
-    findings: list[Finding] = []
-    for each in corrections:
-        if each.kind == 'tag_size':
-            by = 'the wheels' if known is None else 'the map'
-            findings.append(found('tag_size', factor=each.scale(), by=by))
-        else:
-            # Mirror images are what a map alone sets apart.
-            alike = [kinds for kinds in ALIKE if each.kind in kinds]
-            alike = [kinds for kinds in alike if known is None or kinds != MIRRORED]
-            findings += [found(kind) for kind in sorted(*alike or [{each.kind}])]
-    return findings
+        def note_update(update: Update) -> None:
+            recorder.note_update(update)
+            attitudes.append(update.pose[:3, :3])
+            localised.append(estimator.is_localised)
+
+        def so_far(is_hopeless: bool = False) -> _Score:
+            R = np.array(attitudes)
+            return _Score(
+                correction,
+                recorder.likelihood,
+                k * math.log(scale),
+                float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
+                estimator.calibration,
+                sum(localised) / max(len(localised), 1),
+                is_hopeless,
+            )
+
+        estimator = Estimator(settings, on_update=note_update, judges_innovations=True)
+        if self.known is not None:
+            estimator.load_map(self.known)
+        noise = ObservationNoise(settings) if correction.kind == 'tag_size' else None
+        checked_ns = self.events[0].stamp_ns
+        for event in correction.apply(in_blocks(self.events), noise):
+            if isinstance(event, VelocityBlock):
+                estimator.add_velocities(event)
+            else:
+                estimator.add(event)
+                if rival is not None and event.stamp_ns > checked_ns + STRETCH_NS:
+                    checked_ns = event.stamp_ns
+                    if so_far().is_worse_so_far(rival, checked_ns):
+                        return so_far(is_hopeless=True)
+            yield
+        estimator.flush()
+        return so_far()
 
 
 @dataclass(frozen=True, slots=True)
@@ -564,57 +604,3 @@ class _Score:
         """Return how likely points were up to a stamp."""
         part = self.likelihood.select(self.likelihood.stamps_ns <= stamp_ns)
         return replace(self, likelihood=part)
-
-
-def _score(
-    settings: Settings,
-    events: Sequence[Event],
-    correction: Correction,
-    known: Maps | None,
-    rival: _Score | None = None,
-) -> Steps[_Score]:
-    """Run a filter that believes a correction; it is given up once it is worse than a rival."""
-    settings = replace(settings, **correction.changes)
-    k, scale = axes_of(settings.two_d_mode).point, correction.scale()
-    reach = max(
-        float(np.abs(each.points).max(initial=0.0))
-        for each in events
-        if isinstance(each, ObservationEvent)
-    )
-    recorder, attitudes = LikelihoodRecorder(k, scale * reach), [np.eye(3)]
-    localised: list[bool] = []
-
-    def note_update(update: Update) -> None:
-        recorder.note_update(update)
-        attitudes.append(update.pose[:3, :3])
-        localised.append(estimator.is_localised)
-
-    def so_far(is_hopeless: bool = False) -> _Score:
-        R = np.array(attitudes)
-        return _Score(
-            correction,
-            recorder.likelihood,
-            k * math.log(scale),
-            float(np.linalg.norm(so3.log(R[min(1, len(R) - 1)].T @ R), axis=1).max()),
-            estimator.calibration,
-            sum(localised) / max(len(localised), 1),
-            is_hopeless,
-        )
-
-    estimator = Estimator(settings, on_update=note_update, judges_innovations=True)
-    if known is not None:
-        estimator.load_map(known)
-    noise = ObservationNoise(settings) if correction.kind == 'tag_size' else None
-    checked_ns = events[0].stamp_ns
-    for event in correction.apply(in_blocks(events), noise):
-        if isinstance(event, VelocityBlock):
-            estimator.add_velocities(event)
-        else:
-            estimator.add(event)
-            if rival is not None and event.stamp_ns > checked_ns + STRETCH_NS:
-                checked_ns = event.stamp_ns
-                if so_far().is_worse_so_far(rival, checked_ns):
-                    return so_far(is_hopeless=True)
-        yield
-    estimator.flush()
-    return so_far()
