@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 PROGRAM = 'slam-observer'
 
 _FOREVER_S = 1e9
-_COLUMN_FRAME = 3  # characters of a column's border and padding
 
 _Item = TypeVar('_Item')
 
@@ -91,31 +90,16 @@ def _console() -> Console:
 
 
 def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a line for each of ``rows`` on standard output; its first entry is its name.
-
-    Columns that don't fit beside each other follow below, in a table of their own.
-    """
+    """Print a line for each of ``rows`` on standard output; its first entry is its name."""
     console = _console()
-    from rich.cells import cell_len
     from rich.table import Table
 
-    columns = list(zip(headings, *rows, strict=True))
-    widths = [max(map(cell_len, column)) + _COLUMN_FRAME for column in columns]
-    tables: list[list[int]] = [[0, 1]]
-    for number in range(2, len(columns)):
-        if sum(widths[n] for n in (*tables[-1], number)) < console.width:
-            tables[-1].append(number)
-        else:
-            tables.append([0, number])
-    for table in tables:
-        shown = Table(title=title, title_justify='left')
-        headings, *lines = zip(*(columns[number] for number in table), strict=True)
-        for number, heading in enumerate(headings):
-            shown.add_column(heading, overflow='fold', justify='right' if number else 'left')
-        for line in lines:
-            if any(line[1:]):
-                shown.add_row(*line)
-        console.print(shown)
+    shown = Table(title=title, title_justify='left')
+    for number, heading in enumerate(headings):
+        shown.add_column(heading, overflow='fold', justify='right' if number else 'left')
+    for row in rows:
+        shown.add_row(*row)
+    console.print(shown)
 
 
 def table_of(title: str, rows: Mapping[str, str]) -> Table:
