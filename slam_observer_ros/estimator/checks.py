@@ -42,8 +42,7 @@ from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settin
 ROTATION_TOLERANCE = 1e-3
 """How far RᵀR of a pose may be from identity: much further than single precision puts it."""
 
-MAX_STAMP_NS = 2**63 - 1
-"""What fits into the integers of numpy."""
+MAX_STAMP_NS = 2**63 - 1  # what fits into the integers of numpy
 
 MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
@@ -57,8 +56,7 @@ NEARLY = 1.0 - 1e-9
 SECTORS = 12
 """Directions about the vertical axis in each of which the nearest points are used first."""
 
-HALVES = range(AZIMUTH_RANGE + 1)
-"""Kinds of points, whole and half ones."""
+HALVES = range(AZIMUTH_RANGE + 1)  # kinds of points, whole and half ones
 
 _INTEGERS = (int, np.int64)
 _FLOAT64 = np.dtype(np.float64)

@@ -12,12 +12,7 @@ import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
-from slam_observer_ros.events import (
-    AngularVelocityEvent,
-    ObservationEvent,
-    Queued,
-    VelocityBlock,
-)
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, Queued, VelocityBlock
 
 Key: TypeAlias = tuple[int, bool, bytes]
 
@@ -30,8 +25,7 @@ They are more than inputs keep while the node is busy: such were received late, 
 HELD_UP_NS = 250_000_000
 """Stamps far behind, received so soon after one in time, are no sign of a jump of the clock."""
 
-LATENESS_NS = 10_000_000_000
-"""Time over which the lateness of events is observed, nanoseconds."""
+LATENESS_NS = 10_000_000_000  # time over which the lateness of events is observed, nanoseconds
 
 LATENESS_MARGIN = 2
 """Times the lateness of the latest one of that time that an event may have to be put in order."""
@@ -42,8 +36,7 @@ MIN_KNOWN = 1024
 
 _LINEAR, _ANGULAR = b'linear', b'angular'
 
-_NO_STAMP_NS = 2**63 - 1
-"""Beyond all stamps."""
+_NO_STAMP_NS = 2**63 - 1  # beyond all stamps
 
 
 class EventQueue:

@@ -29,10 +29,7 @@ from slam_observer_ros.tracking.waiting_room import Window
 
 logger = logging.getLogger(__name__)
 
-DESIGNS: dict[str, type[Gains]] = {
-    'constant': ConstantGains,
-    'riccati': RiccatiGains,
-}
+DESIGNS: dict[str, type[Gains]] = {'constant': ConstantGains, 'riccati': RiccatiGains}
 """The values of the parameter ``gains``, and what they are."""
 
 GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)

@@ -19,8 +19,7 @@ SAMPLE_NS = LAST_TEST_NS // 10
 """How often it is looked at what was learnt: slips show within ten looks."""
 
 
-SETTLES_NS = UNSEEN_NS + SAMPLE_NS
-"""How long what disturbs may go on after it has shown."""
+SETTLES_NS = UNSEEN_NS + SAMPLE_NS  # how long what disturbs may go on after it has shown
 
 
 class Undisturbed:

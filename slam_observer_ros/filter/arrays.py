@@ -23,14 +23,12 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-UNKNOWN_RAD = 100.0
-"""Standard deviation of an unknown orientation about each axis."""
+UNKNOWN_RAD = 100.0  # standard deviation of an unknown orientation about each axis
 
 FLIP_EVIDENCE = 9.0
 """By how much, as −2 ln of likelihood, an orientation must cost less than its flipped twin."""
 
-FLIP_DISTANCE = 3.0
-"""Standard deviations of the sensor's noise within which a flip does no harm."""
+FLIP_DISTANCE = 3.0  # standard deviations of the sensor's noise within which a flip does no harm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,8 +119,7 @@ def flip_verdicts(evidence: FloatArray, apart: FloatArray) -> tuple[BoolArray, B
     return are_flipped, differ & ~are_flipped & (evidence < FLIP_EVIDENCE)
 
 
-GROWTH = 1.125
-"""How many times as large the storage becomes once it is full."""
+GROWTH = 1.125  # how many times as large the storage becomes once it is full
 
 _BLOCK = 128
 _LOWER = np.tril(np.ones((_BLOCK, _BLOCK), dtype=np.bool_), -1)

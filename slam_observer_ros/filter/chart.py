@@ -45,11 +45,7 @@ class Chart:
     """
 
     def __init__(
-        self,
-        axes: EstimatedAxes,
-        calibrated: int,
-        velocity: int = 0,
-        postponed: int = 0,
+        self, axes: EstimatedAxes, calibrated: int, velocity: int = 0, postponed: int = 0
     ) -> None:
         self.axes, self.turn, self.velocity = axes, axes.turn, velocity
         self.robot = axes.p + calibrated

@@ -16,11 +16,7 @@ from slam_observer_ros.filter.arrays import FilterArrays, SymmetricMatrix
 from slam_observer_ros.filter.chart import Chart, sheared
 from slam_observer_ros.filter.known_landmarks import KnownLandmarks
 from slam_observer_ros.filter.observer import Residuals
-from slam_observer_ros.lie.matrices import (
-    block_diagonal,
-    mended,
-    transpose,
-)
+from slam_observer_ros.lie.matrices import block_diagonal, mended, transpose
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -106,8 +106,7 @@ def part_of_joint(
     return part
 
 
-JITTER_M2 = 1e-12
-"""Added to variances, so that S can be inverted where both sides are exact."""
+JITTER_M2 = 1e-12  # added to variances, so that S can be inverted where both sides are exact
 
 
 def gauge_information(J: FloatArray, S: FloatArray) -> FloatArray:

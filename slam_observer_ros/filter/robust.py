@@ -26,8 +26,7 @@ from slam_observer_ros.lie.matrices import (
 AT_ONCE = 32
 """Points that are used at once. Of more, each block of so many is judged after the one before."""
 
-REWEIGHTINGS = 2
-"""Rounds of reweighted least squares; the weights hardly change after the second."""
+REWEIGHTINGS = 2  # rounds of reweighted least squares; the weights hardly change after the second
 
 HEAVY_TAIL = 2.0
 """Standard deviations from which on the cost of a residual grows in proportion to its distance."""

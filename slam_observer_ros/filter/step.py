@@ -41,12 +41,7 @@ from slam_observer_ros.lie.matrices import (
 from slam_observer_ros.lie.sensor_mounting import sensitivity as sensor_sensitivity
 from slam_observer_ros.models.calibration import calibrated, with_moves
 from slam_observer_ros.models.held_velocities import held, Velocities
-from slam_observer_ros.models.motion_noise import (
-    Factors,
-    learn,
-    motion_noise,
-    MotionFigures,
-)
+from slam_observer_ros.models.motion_noise import Factors, learn, motion_noise, MotionFigures
 from slam_observer_ros.models.point_noise import (
     point_covariances,
     PointFigures,

@@ -32,17 +32,13 @@ from slam_observer_ros.settings.node_settings import InputSettings
 MAX_EMPTY_CLOUDS = 1000
 """Most clouds of a topic that are looked at for one with points, which shows the ids."""
 
-MAX_COMPARED = 5000
-"""Most messages of an odometry whose twist is compared with its pose."""
+MAX_COMPARED = 5000  # most messages of an odometry whose twist is compared with its pose
 
 MAX_CHANGES = 10
 """Changes of the frame of velocities up to which a driver may have been started again."""
 
-MAX_BACK = 0.1
-"""Share of the stamps that may be before the last one's."""
-
-FEWEST_COMPARED = 100
-"""Messages without which nothing is said of who published them."""
+MAX_BACK = 0.1  # share of the stamps that may be before the last one's
+FEWEST_COMPARED = 100  # messages without which nothing is said of who published them
 
 _Decoded = TypeVar('_Decoded')
 

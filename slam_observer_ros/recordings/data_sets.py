@@ -40,8 +40,7 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.recordings.trajectory import LandmarkTruth
 from slam_observer_ros.recordings.writer import DataSet
 
-FIRST_LANDMARK_SUBJECT = 6
-"""Subjects 1 to 5 are the robots."""
+FIRST_LANDMARK_SUBJECT = 6  # subjects 1 to 5 are the robots
 
 ROBOT_SIGHTING = 'robot'
 MISREAD = 'misread'
@@ -53,8 +52,7 @@ _MAX_NUMBER = 4e9
 """More than any time, barcode or distance of MRCLAM; as nanoseconds it is still an int64."""
 
 
-MEASURES = {'point': None, 'bearing': BEARING, 'range': RANGE}
-"""What may be left of whole points."""
+MEASURES = {'point': None, 'bearing': BEARING, 'range': RANGE}  # what may be left of whole points
 
 
 def load_mrclam(folder: Path | str, robot: int, measure: str = 'point') -> DataSet:
@@ -260,8 +258,7 @@ _SHAPES = {
 }
 """Shape of each variable of Starry Night; -1 is the number of images."""
 
-_MAX_SIZE = 1e6
-"""More than any time, pixel or distance of Starry Night."""
+_MAX_SIZE = 1e6  # more than any time, pixel or distance of Starry Night
 
 
 def load_starry_night(file: Path | str) -> DataSet:
@@ -296,11 +293,7 @@ def triangulate(pixels: FloatArray, variables: dict[str, FloatArray]) -> FloatAr
     left_column, left_row, right_column, right_row = pixels
     depth = fu * baseline / (left_column - right_column)
     camera_points = np.stack(
-        (
-            (left_column - cu) * depth / fu,
-            ((left_row + right_row) / 2.0 - cv) * depth / fv,
-            depth,
-        ),
+        ((left_column - cu) * depth / fu, ((left_row + right_row) / 2.0 - cv) * depth / fv, depth),
         axis=-1,
     )
     # Row vectors: p C is Cᵀ p.
@@ -349,8 +342,7 @@ def _sightings(stamps_ns: IntArray, variables: dict[str, FloatArray]) -> list[Ob
     return observations
 
 
-START_NS = NANOSECONDS_PER_SECOND
-"""Stamp of the first pose; zero stands for an unknown time."""
+START_NS = NANOSECONDS_PER_SECOND  # stamp of the first pose; zero stands for an unknown time
 
 LOOP_CLOSURE = 'edge between poses that do not follow each other'
 REPEATED = 'second edge between the same two'

@@ -32,17 +32,13 @@ SKIPPED = 'skipped_pose'
 MAX_SPEED = 50.0
 """Beyond this, rad/s or m/s, it was not the robot that moved: its odometry was reset."""
 
-MIN_JUMP = 0.1
-"""Rad or m up to which two poses may differ in any time: a stamp may be off."""
+MIN_JUMP = 0.1  # rad or m up to which two poses may differ in any time: a stamp may be off
 
 SHORT = 0.5
 """Share of the time that so many poses usually take: in less, they were stamped on arrival."""
 
-RECENT = 50
-"""Poses over which that time is taken."""
-
-PAUSE_NS = 500_000_000
-"""Time without poses that is no interval of bursts, nanoseconds."""
+RECENT = 50  # poses over which that time is taken
+PAUSE_NS = 500_000_000  # time without poses that is no interval of bursts, nanoseconds
 
 
 class PoseDifferences:
@@ -107,10 +103,7 @@ class PoseDifferences:
         return used
 
     def _begin(
-        self,
-        stamp_ns: int,
-        pose: FloatArray,
-        before: tuple[int, FloatArray] | None = None,
+        self, stamp_ns: int, pose: FloatArray, before: tuple[int, FloatArray] | None = None
     ) -> None:
         self.clear()
         self._used, self._before_pause = (stamp_ns, pose), before
@@ -258,17 +251,13 @@ class _Sums:
         return ''
 
 
-MAX_WAITING = 1000
-"""Most measurements that wait for a transform; the oldest go first."""
+MAX_WAITING = 1000  # most measurements that wait for a transform; the oldest go first
 
 NO_TRANSFORM = 'no_transform'
 """Reason under which measurements are dropped that can't be brought into the base frame."""
 
-Measured: TypeAlias = Event | PoseMessage
-"""What a message measures, in the frame that it names."""
-
-DropError: TypeAlias = TransformError | InvalidEventError
-"""Why a measurement makes no event."""
+Measured: TypeAlias = Event | PoseMessage  # what a message measures, in the frame that it names
+DropError: TypeAlias = TransformError | InvalidEventError  # why a measurement makes no event
 
 logger = logging.getLogger(__name__)
 

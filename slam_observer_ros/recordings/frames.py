@@ -20,12 +20,7 @@ from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.findings import found
 from slam_observer_ros.common.stamps import NEAR_NS, StrayStamps, to_s
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import (
-    AngularVelocityEvent,
-    BEARING,
-    ObservationEvent,
-    VelocityEvent,
-)
+from slam_observer_ros.events import AngularVelocityEvent, BEARING, ObservationEvent, VelocityEvent
 from slam_observer_ros.lie import se3
 from slam_observer_ros.messages.clouds import is_measured
 from slam_observer_ros.messages.detections import Camera
@@ -35,11 +30,8 @@ from slam_observer_ros.settings.parameter_table import checked
 
 logger = logging.getLogger(__name__)
 
-HISTORY_NS = 10_000_000_000
-"""How far back transforms are kept; tf2's default."""
-
-ALWAYS_NS = 2**63 - 1
-"""Newest stamp of what is static."""
+HISTORY_NS = 10_000_000_000  # how far back transforms are kept; tf2's default
+ALWAYS_NS = 2**63 - 1  # newest stamp of what is static
 
 
 @dataclass(slots=True)

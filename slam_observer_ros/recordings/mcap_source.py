@@ -45,11 +45,8 @@ from slam_observer_ros.recordings.sources import (
 )
 
 _MAGIC: Final = b'\x89MCAP0\r\n'
-_HEADER: Final = struct.Struct('<BQ')
-"""How a record begins: opcode and length."""
-
-_PRIVATE: Final = 0x80
-"""The least opcode of records that programs may add, which others pass over."""
+_HEADER: Final = struct.Struct('<BQ')  # how a record begins: opcode and length
+_PRIVATE: Final = 0x80  # the least opcode of records that programs may add, which others pass over
 
 _INDEX: Final = struct.Struct('<BQHI')
 """How a message index begins: opcode, length, channel, length of its entries."""
@@ -72,8 +69,7 @@ MESSAGE: Final = np.dtype(
 _ENTRY: Final = np.dtype([('channel', '<u2'), ('stamp_ns', '<u8'), ('begin', '<u8')])
 """What a message index says of a message: where it begins in the chunk, among others."""
 
-LEAST_LENGTH: Final = MESSAGE.itemsize - _HEADER.size
-"""Length of a message without data."""
+LEAST_LENGTH: Final = MESSAGE.itemsize - _HEADER.size  # length of a message without data
 
 MAX_NS: Final = 2**63 - 1
 

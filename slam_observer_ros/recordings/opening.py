@@ -316,11 +316,8 @@ FORMATS: dict[str, Callable[[Path], tuple[MessageSource, str | None]]] = {
 }
 """How a file of each suffix is opened; a directory of rosbag2 has .mcap or .db3 files."""
 
-_MAGIC = bytes.fromhex('28b52ffd')
-"""How what is compressed begins, and no message in CDR does."""
-
-_SHOWN = 10
-"""First messages that are looked at; one may be damaged."""
+_MAGIC = bytes.fromhex('28b52ffd')  # how what is compressed begins, and no message in CDR does
+_SHOWN = 10  # first messages that are looked at; one may be damaged
 
 
 class DecompressedSource(MessageSource):

@@ -29,13 +29,7 @@ from slam_observer_ros.recordings.event_builder import (
 )
 from slam_observer_ros.recordings.frames import BaseFrame, insert_transforms, TransformBuffer
 from slam_observer_ros.recordings.opening import open_source
-from slam_observer_ros.recordings.sources import (
-    FEWEST_IN_BLOCK,
-    Loss,
-    RawBlock,
-    RawMessage,
-    Topic,
-)
+from slam_observer_ros.recordings.sources import FEWEST_IN_BLOCK, Loss, RawBlock, RawMessage, Topic
 from slam_observer_ros.recordings.topics import (
     block_decoder,
     Decode,

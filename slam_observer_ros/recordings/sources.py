@@ -19,12 +19,8 @@ from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.messages.cdr import Buffer
 
-MOST_IN_BLOCK = 4096
-"""Messages of a block at most."""
-
-
-FEWEST_IN_BLOCK = 4
-"""Messages that cost less one by one."""
+MOST_IN_BLOCK = 4096  # messages of a block at most
+FEWEST_IN_BLOCK = 4  # messages that cost less one by one
 
 SAME_TYPES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 """Former names of types, whose bytes are the same."""

@@ -321,9 +321,7 @@ class Truth:
         return replace(self, tracks=self.tracks.flattened(height_m))
 
 
-def _positions_by_stamp(
-    messages: Iterable[ObservationEvent],
-) -> Iterator[tuple[int, _Positions]]:
+def _positions_by_stamp(messages: Iterable[ObservationEvent]) -> Iterator[tuple[int, _Positions]]:
     """Yield what all messages of a stamp hold together, in the order of the stamps."""
     by_stamp = attrgetter('stamp_ns')
     for stamp_ns, together in groupby(sorted(messages, key=by_stamp), key=by_stamp):

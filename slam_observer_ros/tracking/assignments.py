@@ -42,8 +42,7 @@ from slam_observer_ros.tracking.joint_compatibility import (
 from slam_observer_ros.tracking.matching import sensitivity
 from slam_observer_ros.tracking.state import State
 
-MAX_CANDIDATES = 10
-"""Landmarks that a point may be taken for; the nearest, if there are more."""
+MAX_CANDIDATES = 10  # landmarks that a point may be taken for; the nearest, if there are more
 
 FEW_PAIRS = 200
 """Pairs of a point and a landmark of which each is judged: of more, only those that are near."""
@@ -64,11 +63,7 @@ class Assignment:
 
 
 def find_assignments(
-    state: State,
-    event: ObservationEvent,
-    new_costs: NewCosts,
-    budget: float,
-    is_alone: bool,
+    state: State, event: ObservationEvent, new_costs: NewCosts, budget: float, is_alone: bool
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different poses, the most likely first.
 

@@ -15,22 +15,15 @@ from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.filter.robust import accepted, distances, huber_loss
-from slam_observer_ros.lie.matrices import (
-    mahalanobis,
-    with_blocks,
-)
+from slam_observer_ros.lie.matrices import mahalanobis, with_blocks
 from slam_observer_ros.tracking.joint_compatibility import joint_cost, NewCosts, unpaired_cost
-from slam_observer_ros.tracking.matching import (
-    MatchedObservation,
-    rejected_before,
-)
+from slam_observer_ros.tracking.matching import MatchedObservation, rejected_before
 from slam_observer_ros.tracking.state import State
 
 SLIP_COST = 20.0
 """Cost of a slip of the robot, at odds of e¹⁰; what it sees afterwards costs extra."""
 
-SAME_CAUSE_COST = 3.0
-"""Cost of each further point that is rejected for the cause of the first one."""
+SAME_CAUSE_COST = 3.0  # cost of each further point that is rejected for the cause of the first one
 
 MAX_OF_ONE_CAUSE = 3
 """Most points that are charged so: a garbled message is one, however many points it has."""
@@ -91,8 +84,7 @@ def cost_of_staying(state: State, matched: MatchedObservation) -> tuple[BoolArra
     return again, np.minimum(costs, outlier_cost(state))
 
 
-MEMORY_S = 60.0
-"""Time, seconds, after which what was seen counts for a third."""
+MEMORY_S = 60.0  # time, seconds, after which what was seen counts for a third
 
 SHARE_AT_FIRST, POINTS_AT_FIRST = 0.05, 10.0
 """The share as it is taken to be before anything was seen, and how many points that counts for."""

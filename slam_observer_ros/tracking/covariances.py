@@ -90,8 +90,7 @@ def turn_to_world(observer: Observer, A: FloatArray) -> FloatArray:
     return turn
 
 
-SMALL_RAD = 0.05
-"""Standard deviation of the attitude below which the covariance of d_i serves."""
+SMALL_RAD = 0.05  # standard deviation of the attitude below which the covariance of d_i serves
 
 _NODES = np.sqrt(3.0) * np.array([-1.0, 0.0, 1.0])
 _WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0

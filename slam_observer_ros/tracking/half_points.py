@@ -49,14 +49,9 @@ from slam_observer_ros.tracking.waiting_room import (
     Window,
 )
 
-KEPT, FEWEST = 200, 40
-"""Differences of ranges that are kept, and that it takes to judge them."""
-
-LEAST_ANCHORS = 3
-"""Landmarks among which one that is off is known from those that are not."""
-
-LEAST_SHARE = 1e-3
-"""Probability of a straight way below which a range says nothing, either way."""
+KEPT, FEWEST = 200, 40  # differences of ranges that are kept, and that it takes to judge them
+LEAST_ANCHORS = 3  # landmarks among which one that is off is known from those that are not
+LEAST_SHARE = 1e-3  # probability of a straight way below which a range says nothing, either way
 
 LEAST_LEVEL = 0.1
 """Cosine of the steepest line of sight, 84°, whose range says something in the plane."""

@@ -40,8 +40,7 @@ PRUNING_COST, PRUNING_COST_OF_IDS = 16.0, 35.0
 have ids, at odds of e^17.5: a slip costs what it is set to cost, and few points speak for it.
 """
 
-RESOLUTION = 2.0
-"""Standard deviations of the sensor within which two poses can't be distinguished."""
+RESOLUTION = 2.0  # standard deviations of the sensor within which two poses can't be distinguished
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,12 +28,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.robust import accepted, huber_loss
 from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.axes import EstimatedAxes
-from slam_observer_ros.lie.matrices import (
-    mahalanobis,
-    solve_symmetric,
-    transpose,
-    with_blocks,
-)
+from slam_observer_ros.lie.matrices import mahalanobis, solve_symmetric, transpose, with_blocks
 from slam_observer_ros.lie.se3 import rigid_alignment
 from slam_observer_ros.models.held_velocities import HeldVelocities
 from slam_observer_ros.models.motion_noise import beyond_driving
@@ -47,22 +42,16 @@ from slam_observer_ros.tracking.matching import (
 )
 from slam_observer_ros.tracking.state import State
 
-MAX_DURATION_S = 4.0
-"""Time, seconds, for which odometry is taken to have been wrong, at most."""
-
-LARGE_TURN_RAD = 0.3
-"""Turn, radians, that a correction, which is linear in it, does not find well."""
+MAX_DURATION_S = 4.0  # time, seconds, for which odometry is taken to have been wrong, at most
+LARGE_TURN_RAD = 0.3  # turn, radians, that a correction, which is linear in it, does not find well
 
 SHORT_S, TURN_RAD = 1.0, 0.5
 """Time without odometry, seconds, and turns, after which points without ids are looked for: what
 is about one of these turns is found by corrections that are linear in it.
 """
 
-ITERATIONS = 10
-"""Gauss-Newton steps to the likeliest pose; the last ones hardly move it."""
-
-MIN_VARIANCE = 1e-6
-"""Least variance of a motion without odometry, rad² or m²."""
+ITERATIONS = 10  # gauss-Newton steps to the likeliest pose; the last ones hardly move it
+MIN_VARIANCE = 1e-6  # least variance of a motion without odometry, rad² or m²
 
 SLIPS = (np.zeros(6), np.repeat([1.0, 0.0], 3))
 """Shares (6,) of a motion that are made where wheels spin: nothing, or the turn alone."""
@@ -96,8 +85,7 @@ USUAL, FORGOTTEN = 4.0, 0.95
 the factor of the way that this takes, after each comparison: the noise may be less now.
 """
 
-UNSEEN_NS = to_ns(1.0)
-"""For how long a slip goes on unseen."""
+UNSEEN_NS = to_ns(1.0)  # for how long a slip goes on unseen
 
 WINDOWS_S = np.array([0.3, 1.0, 3.0])
 """Times, seconds, after which a view counts for a third: a robot may be pushed fast or slowly."""

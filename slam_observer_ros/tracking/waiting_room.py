@@ -37,8 +37,7 @@ from slam_observer_ros.smoothing.relinearisation import Placed
 if TYPE_CHECKING:
     from slam_observer_ros.tracking.state import State
 
-MOST_VIEWS, FEWEST_VIEWS = 80, 8
-"""Views of a landmark that are kept, and that it takes."""
+MOST_VIEWS, FEWEST_VIEWS = 80, 8  # views of a landmark that are kept, and that it takes
 
 TRY_AGAIN, MOST_BETWEEN = 1.3, 40
 """By how many times the views have grown when it is tried again, and after how many at most."""
@@ -60,8 +59,7 @@ In random halls half as much lets landmarks enter later, with errors a sixth lar
 leaves some of them out.
 """
 
-LIKELY = 2.0
-"""Times as uncertain as sure a place may be that helps others to become sure."""
+LIKELY = 2.0  # times as uncertain as sure a place may be that helps others to become sure
 
 FITS, APART = 2.5, 30.0
 """χ² per view of a solution that fits, and by how much more another one has that does not.
@@ -72,15 +70,11 @@ The odds of the side are e^15 then, beside errors of the way that are twice as s
 SAME, LEAST_APART_M = 1.0, 0.01
 """Standard deviations within which two minima are one, beside what a descent may leave."""
 
-MOST_PLACES = 4
-"""Places that are compared by all that was seen since."""
-
-MOST_AT_ONCE = 4
-"""Sensors, or kinds of views of one, that may show a landmark at once."""
+MOST_PLACES = 4  # places that are compared by all that was seen since
+MOST_AT_ONCE = 4  # sensors, or kinds of views of one, that may show a landmark at once
 
 HUBER, STEPS = 2.0, 20
-DEPTHS_M = (1.0, 4.0, 15.0)
-"""Distances along a bearing from which a solution is sought."""
+DEPTHS_M = (1.0, 4.0, 15.0)  # distances along a bearing from which a solution is sought
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,11 +294,7 @@ class WaitingRoom:
         return line, turned @ of_point @ turned.T / scale**2
 
     def _placed(
-        self,
-        state: State,
-        problem: _PlaceProblem,
-        found: list[Placed],
-        seen: list[Keyframe],
+        self, state: State, problem: _PlaceProblem, found: list[Placed], seen: list[Keyframe]
     ) -> tuple[Placed | None, bool]:
         """Return which of the places ``found`` is best, if any, and whether another fits, too.
 

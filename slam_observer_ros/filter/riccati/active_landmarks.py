@@ -23,8 +23,7 @@ from slam_observer_ros.lie.matrices import symmetric
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-CHECK_INTERVAL = 20
-"""Observations in which each landmark is compared with its reference once."""
+CHECK_INTERVAL = 20  # observations in which each landmark is compared with its reference once
 
 SHRINK_INTERVAL = 50
 """Observations after which a flood of points is over, if none of them needed half as many."""

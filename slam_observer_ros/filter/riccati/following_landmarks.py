@@ -20,8 +20,7 @@ from slam_observer_ros.filter.riccati.outside_landmarks import (
 from slam_observer_ros.filter.riccati.postponed import PostponedCorrection
 from slam_observer_ros.lie.matrices import transpose
 
-REFERENCE_SHIFT_M = 0.1
-"""How far estimates of landmarks out of view may be from their references."""
+REFERENCE_SHIFT_M = 0.1  # how far estimates of landmarks out of view may be from their references
 
 CHANGE_INTERVAL = 64
 """Corrections until a change has come to all landmarks, if no other has to begin before."""

@@ -15,11 +15,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.filter.chart import Chart
-from slam_observer_ros.filter.riccati.postponed import (
-    PANEL_ROWS,
-    PanelMatrix,
-    PostponedCorrection,
-)
+from slam_observer_ros.filter.riccati.postponed import PANEL_ROWS, PanelMatrix, PostponedCorrection
 from slam_observer_ros.lie.matrices import diagonal_blocks, transpose
 
 

@@ -114,8 +114,7 @@ class PostponedCorrection:
 PANEL_ROWS = 96
 """Rows of a panel: landmarks do not straddle two, in space or in a plane, points or tags."""
 
-FOLDED_RANK = 64
-"""Columns of U that are added to B at a time."""
+FOLDED_RANK = 64  # columns of U that are added to B at a time
 
 
 class PanelMatrix:

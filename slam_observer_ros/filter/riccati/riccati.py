@@ -40,8 +40,7 @@ from slam_observer_ros.models.point_noise import PointFigures
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-MERGER_ROUNDS = 4
-"""How often a merger is linearised; the last times it hardly changes."""
+MERGER_ROUNDS = 4  # how often a merger is linearised; the last times it hardly changes
 
 SAME_M = 0.01
 """Standard deviation of how far apart two landmarks may be that are one, metres: no two views of
