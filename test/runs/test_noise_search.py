@@ -92,21 +92,6 @@ def test_noise_that_was_stated_wrong_is_found(slam_observer, tmp_path):
     assert replayed['configuration_anees'] == pytest.approx(found['held_out']['anees'][1])
 
 
-@pytest.mark.timeout(500)
-def test_what_holds_no_further_is_no_improvement(slam_observer, tmp_path):
-    recording, out = simulated(tmp_path / 'run.mcap', 1), tmp_path / 'found.yaml'
-    right = [
-        word
-        for name, value in TRUE_NOISE.items()
-        for word in ('--set', f'{name}={[value] * 3 if "velocity" in name else value}')
-    ]
-    ended = slam_observer('calibrate', recording, *ONLY, *MODEL, *right, '--out', out)
-    assert ended.code == 4
-    assert 'no improvement: on what was held out' in ended.errors
-    assert 'held out' in ended.output
-    assert not out.exists()
-
-
 def test_what_noise_can_not_be_found_by_is_refused(slam_observer, tmp_path):
     path = tmp_path / 'run.mcap'
     point = np.array([[1.0, 0.0, 0.0]])
