@@ -49,7 +49,7 @@ def identity(recording: Path, sha256: str, result: Result) -> dict[str, object]:
 
 def as_json(result: Result) -> dict[str, object]:
     """Return the figures as ``--json`` prints them; null is what was not measured."""
-    run, selected, accuracy = result.run, result.selected, result.accuracy
+    run, selected, configuration = result.run, result.selected, result.run.configuration
     estimator, errors, after = run.estimator, result.errors, result.smoothed
     return {
         'velocity_topic': selected.velocity.name,
@@ -73,12 +73,12 @@ def as_json(result: Result) -> dict[str, object]:
         'unaligned_rmse_m': errors.unaligned_rmse_m if errors and run.in_known_map else None,
         'rotation_rmse_rad': None if errors is None else errors.rotation_rmse_rad,
         'heading_rmse_rad': None if errors is None else errors.heading_rmse_rad,
-        'landmark_rmse_m': accuracy.landmark_rmse_m,
-        'configuration_rmse_m': accuracy.configuration_rmse_m,
-        'anees': accuracy.anees,
-        'configuration_anees': accuracy.configuration_anees,
+        'landmark_rmse_m': result.landmark_rmse_m,
+        'configuration_rmse_m': configuration.rmse_m,
+        'anees': result.anees,
+        'configuration_anees': configuration.anees,
         'nis': result.nis,
-        'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
+        'dead_reckoning_ate_rmse_m': _ate_rmse_m(result.dead_reckoning_errors),
         'unsmoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.online_errors),
         'smoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.pose_errors),
         'smoothed_landmark_rmse_m': None if after is None else after.landmark_rmse_m,

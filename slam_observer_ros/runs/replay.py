@@ -41,7 +41,7 @@ from slam_observer_ros.runs.metrics import (
 )
 from slam_observer_ros.runs.mistakes import leaves_mount_open, mistakes
 from slam_observer_ros.runs.recorders import DeadReckoning, NisTally, PoseSamples, RunRecorder
-from slam_observer_ros.runs.result import Accuracy, Replay, Request, Result, SmoothedRun
+from slam_observer_ros.runs.result import Replay, Request, Result, SmoothedRun
 from slam_observer_ros.runs.run_health import judged, of_use, unused_messages
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -109,7 +109,7 @@ def result_of(
                 run,
                 selected,
                 truth,
-                measure(run, truth),
+                *_errors(run, truth),
                 recording.duration_s,
                 unused_messages(recording, selected),
                 recording.contents.missing_ids(selected.landmarks),
@@ -382,19 +382,19 @@ STILL = 1e-12
 """Change of a pose, m and rad, below which it is rounding: a robot at rest has no bias."""
 
 
-def measure(run: Replay, truth: Truth) -> Accuracy:
-    """Compare what came of a replay with the truth."""
+def _errors(
+    run: Replay, truth: Truth
+) -> tuple[TrajectoryErrors | None, TrajectoryErrors | None, float | None, float | None]:
+    """Return the errors of a :class:`.Result`: trajectory, dead reckoning, map; and the ANEES."""
     pose_truth, estimator = truth.trajectory, run.estimator
-    errors = (
-        _pose_errors('trajectory', run.trajectory, pose_truth),
-        _pose_errors('dead reckoning', run.dead_reckoning, pose_truth),
-        _map_rmse_m(estimator.landmark_ids, estimator.world_points, truth),
-    )
+    errors = _pose_errors('trajectory', run.trajectory, pose_truth)
+    reckoned = _pose_errors('dead reckoning', run.dead_reckoning, pose_truth)
+    map_rmse_m = _map_rmse_m(estimator.landmark_ids, estimator.world_points, truth)
     anees = None
     if not run.in_known_map and (covariances := run.pose_covariances) is not None:
         with _unknown_if_unfit('unknown_anees'):
             anees = anchored_average_nees(run.trajectory, covariances, pose_truth)
-    return Accuracy(*errors, run.configuration.rmse_m, anees, run.configuration.anees)
+    return errors, reckoned, map_rmse_m, anees
 
 
 def smoothed_run(run: Replay, truth: Truth) -> SmoothedRun:

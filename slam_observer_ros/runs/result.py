@@ -149,27 +149,8 @@ class Replay:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Accuracy:
-    """Errors of a replay; None where the truth that it takes is not in the recording.
-
-    Poses, dead reckoning and the map are each compared after one rigid alignment of
-    their own; the configuration (:class:`.ConfigurationError`) takes none. ``anees`` of the pose
-    is also None where the gains know no covariance, and where no pose is certain to which the
-    truth could be moved: in a known map, or if the truth begins too late. ``configuration_anees``
-    needs no certain pose, but a joint covariance.
-    """
-
-    pose_errors: TrajectoryErrors | None
-    dead_reckoning_errors: TrajectoryErrors | None
-    landmark_rmse_m: float | None
-    configuration_rmse_m: float | None
-    anees: float | None
-    configuration_anees: float | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SmoothedRun:
-    """What was smoothed, and its errors as :class:`Accuracy` has them.
+    """What was smoothed, and its errors as :class:`Result` has them.
 
     The trajectory is at the stamps of the online one since the first of these observations, and
     ``online_errors`` are of that part.
@@ -203,12 +184,20 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """All that came of a recording."""
+    """All that came of a recording; errors are None where the truth is not in it.
+
+    Poses, dead reckoning and the map are each compared after one rigid alignment of their own.
+    ``anees`` of the pose is also None where the gains know no covariance, and where no pose is
+    certain to which the truth could be moved: in a known map, or if the truth begins too late.
+    """
 
     run: Replay
     selected: SelectedTopics
     truth: Truth
-    accuracy: Accuracy
+    errors: TrajectoryErrors | None  # of the online trajectory
+    dead_reckoning_errors: TrajectoryErrors | None
+    landmark_rmse_m: float | None
+    anees: float | None
     duration_s: float  # that the recording spans
     unused: Counter[str]  # messages that did not become events, by reason
     missing_ids: str  # what Contents.missing_ids says of the landmarks
@@ -265,11 +254,6 @@ class Result:
     def trajectory(self) -> Trajectory:
         """The smoothed trajectory, if that was asked for; else the online one."""
         return self.run.trajectory if self.smoothed is None else self.smoothed.trajectory
-
-    @property
-    def errors(self) -> TrajectoryErrors | None:
-        """Errors of the online trajectory; None without true poses."""
-        return self.accuracy.pose_errors
 
     @property
     def localised_after_s(self) -> float | None:

@@ -270,7 +270,7 @@ def of_errors(result: Result) -> Iterator[Finding]:
     """Judge where the error grew, and which noise explains less than what is seen."""
     if result.errors is not None:
         yield from _of_growth(result, result.errors)
-    anees = result.accuracy.anees or 0.0
+    anees = result.anees or 0.0
     is_overconfident = anees > MAX_ANEES
     yield from rule(is_overconfident, 'overconfident_pose', factor=np.sqrt(anees), anees=anees)
     if result.errors is not None:
