@@ -24,10 +24,8 @@ from slam_observer_ros.messages.outgoing import (
 from slam_observer_ros.messages.poses import ODOMETRY, TRANSFORMS
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.topics import SelectedTopics
-from slam_observer_ros.recordings.trajectory import LandmarkTruth
 from slam_observer_ros.runs.health import estimator_values, of_now
-from slam_observer_ros.runs.metrics import TrajectoryErrors
-from slam_observer_ros.runs.result import Request
+from slam_observer_ros.runs.result import Request, Result
 from slam_observer_ros.settings.node_settings import InputSettings, ObserverNodeSettings
 
 if TYPE_CHECKING:
@@ -109,10 +107,9 @@ class EstimateWriter:
             per_degree = innovation.nis / innovation.degrees_of_freedom
             self._write('/nis', self._messages.value(per_degree), update.stamp_ns)
 
-    def finish(
-        self, estimator: Estimate, errors: TrajectoryErrors | None, landmarks: LandmarkTruth | None
-    ) -> None:
+    def finish(self, result: Result) -> None:
         """Write the path, the map at the end, and the truth moved to where the estimate has it."""
+        estimator, errors = result.run.estimator, result.errors
         stamp_ns = estimator.stamp_ns
         if stamp_ns is not None and estimator.is_localised:
             self._write('/path', self._messages.path(stamp_ns, self._path), stamp_ns)
@@ -122,12 +119,9 @@ class EstimateWriter:
         truth = errors.aligned_truth
         for true_ns, pose in zip(truth.stamps_ns.tolist(), truth.poses, strict=True):
             self._write(ALIGNED_POSE_TOPIC, self._messages.path_pose(true_ns, pose), true_ns)
-        if landmarks is not None:
-            first_ns = int(truth.stamps_ns[0])
-            points = errors.in_estimate(landmarks.world_points)
-            cloud = self._writer.messages.point_cloud2(
-                first_ns, self._map_frame, landmarks.ids, points
-            )
+        if (landmarks := result.aligned_landmarks) is not None:
+            first_ns, aligned = int(truth.stamps_ns[0]), (landmarks.ids, landmarks.world_points)
+            cloud = self._writer.messages.point_cloud2(first_ns, self._map_frame, *aligned)
             self._write(ALIGNED_LANDMARKS_TOPIC, cloud, first_ns, latched=True)
 
     def _write_state(self, estimator: Estimate, stamp_ns: int) -> None:

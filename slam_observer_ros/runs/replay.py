@@ -120,7 +120,7 @@ def result_of(
                 notes.finish(run.estimator) if request.keeps_run else (),
             )
             if writer is not None:
-                writer.finish(run.estimator, result.errors, truth.landmarks)
+                writer.finish(result)
         findings = judged(result, recording, inputs, unused, map_path, look_for_mistakes)
     for finding in findings:
         if finding.level >= Level.WARNING:
