@@ -311,10 +311,7 @@ def shard_of(text: str) -> tuple[int, int]:
 
 
 def part_of(recordings: Sequence[Path], points: int, shard: tuple[int, int]) -> list[range]:
-    """Return which points a shard is to run of each recording: it takes runs in a row.
-
-    So it has to read as few recordings as can be.
-    """
+    """Return a shard's points of each recording: runs in a row, as it then reads few files."""
     number, count = shard
     total = len(recordings) * points
     first, last = ((number - 1) * total // count, number * total // count)
@@ -520,10 +517,7 @@ def local_pool(workers: int) -> Pool:
 
 
 def cluster_pool(address: str, jobs: int) -> Pool:
-    """Return a pool of a Dask scheduler's workers, which share out all jobs among them.
-
-    Raises a UsageError if no scheduler answers there.
-    """
+    """Return a pool of a Dask scheduler's workers; a UsageError if none answers there."""
     with _cluster(address, jobs):
         pass
     return Pool(partial(_cluster, address), jobs)

@@ -252,10 +252,7 @@ def _events(simulation: Simulation, description: str) -> Iterator[SimulatedEvent
 def _draw(
     simulation: Simulation, result: SimulatedRun, directory: Path, figures: Mapping[str, str]
 ) -> None:
-    """Draw the figures, files by name, which go to a directory when all are written.
-
-    Raises an OutputError if that fails.
-    """
+    """Draw figures, files by name: all are written to a directory, or an OutputError is raised."""
     # matplotlib takes longer to import than the simulation
     from slam_observer_ros.runs.figures import plot_configuration, plot_lyapunov
 

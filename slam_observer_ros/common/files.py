@@ -28,10 +28,7 @@ _UTF16_MARKS = (b'\xff\xfe', b'\xfe\xff')
 
 
 def not_special(path: Path) -> Path:
-    """Return a path where a regular file or directory is; raise an OSError otherwise.
-
-    Reading a pipe or a device might never end.
-    """
+    """Return the path of a file or directory; an OSError for a pipe, which might never end."""
     mode = checked_name(path).stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, 'it is no regular file', str(path))
@@ -200,10 +197,7 @@ def load_yaml(
 
 
 def constructed(kind: str, text: str) -> object:
-    """Return a bool, float, int, null, str or timestamp of YAML 1.1; a ValueError if it is none.
-
-    That is what ``!!kind text`` means.
-    """
+    """Return what ``!!kind text`` means in YAML 1.1, of _SCALARS; a ValueError if it is none."""
     construct = yaml.SafeLoader.yaml_constructors[_STANDARD + kind]
     try:
         value: object = construct(_CONSTRUCTOR, yaml.ScalarNode(_STANDARD + kind, text))

@@ -54,10 +54,7 @@ class _Stop:
 
 
 def stopping_once() -> _Stop:
-    """Return a handler of signals, which handles Ctrl-C from now on.
-
-    Who ignores Ctrl-C, as a job in the background does, goes on doing so.
-    """
+    """Return a handler of signals, which takes Ctrl-C from now on, unless that is ignored."""
     handler, stop = signal.getsignal(signal.SIGINT), _Stop()
     if handler is signal.default_int_handler or isinstance(handler, _Stop):
         signal.signal(signal.SIGINT, stop)

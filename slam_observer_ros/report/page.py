@@ -232,10 +232,7 @@ def _landmarks(result: Result) -> list[Json]:
 
 
 def _errors(result: Result) -> dict[str, Json]:
-    """Return position errors and the half-axis of the stated 95 % ellipse, metres.
-
-    The heading errors are in degrees, after the alignment.
-    """
+    """Return errors of position, m, and heading, °, and half-axes of 95 % ellipses."""
     innovations, configuration = result.innovations, result.run.configuration
     bounds_m = [
         np.nan

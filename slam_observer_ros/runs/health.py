@@ -451,10 +451,7 @@ def deviations(estimator: Estimate) -> tuple[float, float] | None:
 def localisation(
     estimator: Estimate, limits: ObserverNodeSettings, share: float = 1.0
 ) -> tuple[Level, str]:
-    """Judge, in words too, how well the pose is known.
-
-    The robot is lost from a share of the error level on.
-    """
+    """Judge, in words too, how well the pose is known: lost from a share of the error level on."""
     if estimator.stamp_ns is None:
         return Level.WARNING, 'no estimate yet'
     if not estimator.is_localised:

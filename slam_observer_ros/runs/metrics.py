@@ -275,10 +275,7 @@ def normalised_squared_errors(
 
 
 def average_nees(errors: FloatArray, covariances: FloatArray) -> float | None:
-    """Return the ANEES of all runs and times: above 1 is overconfident, below 1 too cautious.
-
-    None where every component is known exactly.
-    """
+    """Return the ANEES: above 1 is overconfident, below too cautious; None where all is exact."""
     nees, degrees_of_freedom = normalised_squared_errors(errors, covariances)
     total = int(degrees_of_freedom.sum())
     return float(nees.sum() / total) if total else None

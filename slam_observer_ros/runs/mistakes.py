@@ -175,10 +175,7 @@ LONGER = 2.0
 
 
 def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
-    """Return the events until the robot has driven for DRIVE_S, with points that have ids.
-
-    Or until so many times, or a ``part`` of, that.
-    """
+    """Return events, with ids alone, until a ``part`` of DRIVE_S is driven, or of MOST_S over."""
     kept: list[Event] = []
     drive, first_ns = Drive(), None
     for event in events:
@@ -386,10 +383,7 @@ class _Trial:
         return any(len(each.ids) for each in self.events if isinstance(each, ObservationEvent))
 
     def mount(self) -> Steps[list[Finding]]:
-        """Return how a sensor is turned against what is stated, by more than brackets usually are.
-
-        If points are likelier where that is estimated.
-        """
+        """Return how a sensor is turned further than brackets are, if points are likelier so."""
         if not self.sees_any():
             return []
         open_mount = Correction('', changes={'sensor_rotation_stddev': ROTATION})

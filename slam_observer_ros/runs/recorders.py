@@ -26,10 +26,7 @@ SAMPLE_PERIOD_NS = 50_000_000  # least time between two poses of a sampled traje
 
 
 class PoseSamples:
-    """Poses (4, 4) with their stamps, none less than a period after the one before.
-
-    Where not all are kept, the first and the last are.
-    """
+    """Poses (4, 4) at least a period apart, and their stamps: all, or the first and the last."""
 
     def __init__(self, keep_all: bool = True) -> None:
         self._keep_all = keep_all

@@ -238,10 +238,7 @@ class Settings:
 
 
 class LiveSettings(Settings):
-    """The settings in force: a copy that follows changes, as some change while a node runs.
-
-    All that hold it see them, and copies share it.
-    """
+    """The settings in force, which change while a node runs: all that hold them see that."""
 
     @classmethod
     def of(cls, settings: Settings) -> LiveSettings:

@@ -130,10 +130,7 @@ class InputSettings:
     # fmt: on
 
     def with_plain_frames(self: InputSettingsT) -> InputSettingsT:
-        """Return the settings with frames as tf2 has them, without a leading slash.
-
-        If the map's frame has no name, a ParameterError says so.
-        """
+        """Return them with frames as tf2 has them; a ParameterError if the map's has no name."""
         names = ('map_frame', 'odom_frame', 'base_frame', 'sensor_frame')
         plain = replace(self, **{name: getattr(self, name).lstrip('/') for name in names})
         if not plain.map_frame:

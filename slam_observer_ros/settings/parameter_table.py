@@ -67,10 +67,7 @@ class Parameter:
     basic: bool = False
 
     def check(self, value: object) -> Value:
-        """Return ``value`` in this parameter's type.
-
-        A ParameterError names the parameter, what it got and what it takes.
-        """
+        """Return ``value`` in this parameter's type; a ParameterError names it if it can't be."""
         default = self.default
         if isinstance(default, bool):
             self._expect(value, isinstance(value, bool), 'true or false')
