@@ -126,7 +126,7 @@ def test_ranges_through_walls_do_not_mislead_it(seed):
     assert off_m is not None and off_m < 0.05 * hall.size_m
 
 
-@pytest.mark.parametrize(('seed', 'turns'), [(0, True), (1, True), (2, False), (3, False)])
+@pytest.mark.parametrize(('seed', 'turns'), [(0, True), (2, False)])
 def test_ranges_from_anchors_in_a_line_leave_the_side_open(seed, turns):
     hall = Hall(seed, in_a_line=True, turns=turns)
     assert hall.drive([RANGE]) is None

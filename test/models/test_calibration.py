@@ -367,7 +367,7 @@ def test_a_precise_robot_does_not_take_its_yaw_bias_for_moved_landmarks():
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_where_there_is_no_bias_estimating_it_costs_next_to_nothing(two_d_mode):
     settings = Settings(two_d_mode=two_d_mode)
-    worlds = [drive(settings, 60.0, seed) for seed in range(6)]
+    worlds = [drive(settings, 60.0, seed) for seed in range(3)]
     error_m, moved = rms_error_and_moved(settings, worlds)
     left_alone = replace(settings, angular_bias_stddev=NO_BIAS)
     assert error_m < 1.01 * rms_error_and_moved(left_alone, worlds)[0]

@@ -37,7 +37,7 @@ def test_unknown_covariances_are_numbers_however_the_sensor_is_mounted(known_m2)
 
 def test_a_late_observation_of_unknown_covariance_leaves_the_state_a_state():
     rng = np.random.default_rng(1)
-    for _ in range(50):
+    for _ in range(15):
         estimator = Estimator(Settings(reorder_window=0.0, confirmations=1))
         turning = np.concatenate([rng.normal(size=3), [1.0, 0.0, 0.0]])
         points, ids = rng.normal(scale=4.0, size=(3, 3)), np.arange(3)
