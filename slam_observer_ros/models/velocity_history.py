@@ -202,31 +202,35 @@ class VelocityHistory:
 
     def flat(self) -> Velocities:
         """Return all that are known as plain arrays."""
-        linear_s = self._periods.usual_s
-        angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
-        return self._flat(self._count, angular_s, linear_s)
-
-    def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
-        """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
-        counts = self.flat().stamps_ns.searchsorted(stamps_ns, 'right')
-        usual_s = self._joined.usual_s[counts - 1].tolist()
-        return [
-            self._flat(count, *each) for count, each in zip(counts.tolist(), usual_s, strict=True)
-        ]
-
-    def _flat(self, count: int, usual_angular_s: float, usual_linear_s: float) -> Velocities:
-        """Return the first so many."""
-        joined = self._joined
+        joined, count, linear_s = self._joined, self._count, self._periods.usual_s
         return Velocities(
             joined.stamps_ns[:count],
             joined.body_velocities[:count],
             joined.since_ns[:count],
             joined.is_stated[:count],
             joined.covariances[:count],
-            usual_angular_s,
-            usual_linear_s,
+            linear_s if self._angular is None else self._angular_periods.usual_s,
+            linear_s,
             self._timeout_ns,
         )
+
+    def flat_then(self, stamps_ns: IntArray) -> list[Velocities]:
+        """Return :meth:`flat` as it was at each of increasing stamps (s,)."""
+        flat = self.flat()
+        counts = flat.stamps_ns.searchsorted(stamps_ns, 'right')
+        usual_s = self._joined.usual_s[counts - 1].tolist()
+        return [
+            flat._replace(
+                stamps_ns=flat.stamps_ns[:count],
+                body_velocities=flat.body_velocities[:count],
+                since_ns=flat.since_ns[:count],
+                is_stated=flat.is_stated[:count],
+                covariances=flat.covariances[:count],
+                usual_angular_s=angular_s,
+                usual_linear_s=linear_s,
+            )
+            for count, (angular_s, linear_s) in zip(counts.tolist(), usual_s, strict=True)
+        ]
 
     @property
     def begins_ns(self) -> int | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -249,24 +250,24 @@ class State:
         )
 
 
+@dataclass(slots=True, eq=False)
 class Association:
     """Which landmarks of a ``state`` the points (m,) of an observation are of, and what it did.
 
-    ``rows`` (m,) are −1 for new landmarks. If it ``may_refuse``, it ``is_refused`` where most
-    points of known ones are rejected: nothing has changed then, and there is no ``update``.
+    If it ``may_refuse``, it ``is_refused`` where most points of known landmarks are rejected:
+    nothing has changed then, and there is no ``update``.
     """
 
-    known: BoolArray  # (m,) points of landmarks that were known before
-    seen: Seen  # what the filter was given …
-    out: Observed  # … and its answer
-    rejected: BoolArray  # (m,)
-    in_map: ObservationEvent  # the points whose landmarks are in the map by now …
-    at: IntArray  # … and the rows of these
-    in_doubt: BoolArray  # whether these were rejected too often
-    update: Update
-    is_refused = False
-
-    def __init__(
-        self, state: State, event: ObservationEvent, rows: IntArray, may_refuse: bool = False
-    ) -> None:
-        self.state, self.event, self.rows, self.may_refuse = state, event, rows, may_refuse
+    state: State
+    event: ObservationEvent
+    rows: IntArray  # (m,) −1 for new landmarks
+    may_refuse: bool = False
+    is_refused: bool = False
+    known: BoolArray = field(init=False)  # (m,) points of landmarks that were known before
+    seen: Seen = field(init=False)  # what the filter was given …
+    out: Observed = field(init=False)  # … and its answer
+    rejected: BoolArray = field(init=False)  # (m,)
+    in_map: ObservationEvent = field(init=False)  # points whose landmarks are in the map by now …
+    at: IntArray = field(init=False)  # … and the rows of these
+    in_doubt: BoolArray = field(init=False)  # whether these were rejected too often
+    update: Update = field(init=False)

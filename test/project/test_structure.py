@@ -43,10 +43,10 @@ def test_folders_show_the_architecture(structure):
 
 def test_a_step_with_ids_takes_no_more_calls_than_it_did(structure):
     step = structure.traced_step()
-    # Of the reference in numpy; with the compiled core it is half as many.
+    # With the compiled core; the reference in numpy takes twice as many.
     assert len(step.modules) <= 24
-    assert step.functions <= 90
-    assert step.changes <= 53
+    assert step.functions <= 88
+    assert step.changes <= 52
     assert step.depth <= 12
 
 
