@@ -28,7 +28,6 @@ MAX_CANDIDATES = 10  # landmarks that another one may be: the likeliest, if ther
 # thing have quite the same centre.
 LEAST_M = 0.01
 NEIGHBOURS = 4  # landmarks next to one that say how many there are about it
-SHOULD_BE_SEEN = 3.0  # −ln of the probability below which it is no chance to miss a landmark
 
 
 class LoopClosure:
@@ -64,7 +63,7 @@ class LoopClosure:
         """Count landmarks added where known ones, which they can't be, should be seen."""
         landmarks, known = state.landmarks, state.confirmed
         missed = landmarks.missed[known]
-        absent = known[missed * landmarks.rate > SHOULD_BE_SEEN]
+        absent = known[missed * landmarks.rate > SURE]
         added = known[is_automatic(landmarks.ids[known]) & (missed == 0)]
         if not len(absent) or not len(added):
             return
