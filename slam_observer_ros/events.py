@@ -22,18 +22,14 @@ from slam_observer_ros.lie.matrices import limited, MAX_DEVIATION
 from slam_observer_ros.lie.sensor_mounting import Sensed
 
 UNKNOWN_ID = -1  # landmark id of a point that its sensor could not identify
-
-IMPOSSIBLE_ID = -(2**31)
-"""Landmark id of a point whose message has a number there that can't be one: it is not used."""
+IMPOSSIBLE_ID = -(2**31)  # landmark id of a point whose message has no possible one: not used
 
 POINT, BEARING, RANGE, AZIMUTH, AZIMUTH_RANGE = range(5)
 """What is measured of a landmark: all; its direction; its distance; or its direction about the
 base's z, alone or with the distance. What is not measured is no part of the event."""
 
 RANGES = RANGE, AZIMUTH_RANGE  # half points with a distance, as radios measure it
-
-MAX_ID = 2**32 - 2
-"""Largest landmark id: they go out as uint32, whose last one says that it is unknown."""
+MAX_ID = 2**32 - 2  # largest landmark id: they go out as uint32, whose last one is 'unknown'
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +219,7 @@ Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
 MeasuredVelocity: TypeAlias = VelocityEvent | VelocityBlock | AngularVelocityEvent
 """One velocity, or several that follow each other."""
 
-Queued: TypeAlias = MeasuredVelocity | ObservationEvent
-"""An event as it is put in order of stamps, and then used."""
+Queued: TypeAlias = MeasuredVelocity | ObservationEvent  # as it is put in order of stamps
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:

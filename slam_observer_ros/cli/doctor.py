@@ -49,9 +49,7 @@ LISTENER = 'slam_observer_ros.nodes.live_inputs'
 """The program that hears topics; it is one of its own, as only ``nodes/`` knows ROS."""
 
 PATIENCE_S = 20.0  # time for that to start and to end, beyond the time of listening
-
-COMMON_PACKAGES = ('geometry_msgs', 'nav_msgs', 'sensor_msgs')
-"""Packages of messages that every ROS has."""
+COMMON_PACKAGES = ('geometry_msgs', 'nav_msgs', 'sensor_msgs')  # which every ROS has
 
 OPTIONAL_PACKAGES = {
     'rosbags': 'recordings',
@@ -170,16 +168,9 @@ def _topics(seconds: float) -> list[dict[str, Any]]:
 
 
 MOST_EVENTS = 60_000  # events of a recording that are looked at, from its start
-
-REPEATED = 0.5
-"""Share of the velocities that are exactly the one before beyond which they are commands."""
-
-
+REPEATED = 0.5  # share of velocities that are the one before, beyond which they are commands
 FEW = 50  # points of an observation, in the median, up to which they are landmarks and no raw scan
-
-FAR_M = 5.0
-"""Range beyond which a camera reads hardly a tag; a laser sees most of its reflectors there."""
-
+FAR_M = 5.0  # range at which a camera reads hardly a tag, and a laser most of its reflectors
 FAR_SHARE = 0.25  # share of the points that are so far where a laser scanner sees them
 
 

@@ -40,11 +40,8 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 from slam_observer_ros.simulation import Scenario, SimulatedEvent, Simulation
 
-LYAPUNOV_FLOOR = 1e-40
-"""What log10 L is taken of where every residual is exactly zero, so that it stays finite."""
-
-ROUNDING_MARGIN = 1e6
-"""How far above the level of rounding L must be for the slope to be fitted to it."""
+LYAPUNOV_FLOOR = 1e-40  # L where all residuals are exactly zero, so that its log is finite
+ROUNDING_MARGIN = 1e6  # how far above rounding L must be for the slope to be fitted to it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -163,8 +163,7 @@ def _remove_left(paths: Iterable[Path]) -> None:
                 os.close(descriptor)
 
 
-MAX_LEVELS: Final = 30
-"""How deep lists and mappings may be in each other; parameters and maps have less than ten."""
+MAX_LEVELS: Final = 30  # of lists and mappings in each other; ours have less than ten
 
 FAST_LOADER: Final[Any] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 """Reads many megabytes, where libyaml is; what it says of mistakes is less than PyYAML does."""

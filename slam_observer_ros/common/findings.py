@@ -424,8 +424,7 @@ EXPLAINED: Mapping[str, frozenset[str]] = {
 }
 """By the kinds of causes: which findings they explain, whose remedies would be untrue."""
 
-ODOMETRY_CAUSES = frozenset(EXPLAINED) - MISTAKES
-"""Causes while which nothing can be learnt of the odometry."""
+ODOMETRY_CAUSES = frozenset(EXPLAINED) - MISTAKES  # by which nothing is learnt of the odometry
 
 SUSPICIOUS = SYMPTOMS - {'large_noise', 'error_growth', 'axis_noise', 'left_out_points'}
 """Symptoms that are reason to look for a mistake."""

@@ -32,9 +32,7 @@ def use_one_thread() -> None:
 
 
 SIGNALLED = 128  # to which the number of the signal that ended the program is added, as shells do
-
-PATIENCE_S = 2.0
-"""How long clearing away takes at most until the next signal ends the program at once."""
+PATIENCE_S = 2.0  # of clearing away, until the next signal ends the program at once
 
 
 class _Stop:
@@ -123,8 +121,7 @@ class StopSignal:
         self.is_set = True
 
 
-VARIABLE = 'SLAM_OBSERVER_CORE'
-"""Environment variable that chooses the references where it is ``numpy``."""
+VARIABLE = 'SLAM_OBSERVER_CORE'  # environment variable; numpy chooses the references
 
 PACKAGE = Path(__file__).parents[1]
 

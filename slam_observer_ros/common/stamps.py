@@ -27,11 +27,8 @@ def to_s(nanoseconds: int | IntArray) -> float | FloatArray:
     return nanoseconds / NANOSECONDS_PER_SECOND
 
 
-AGREEING_STAMPS = 5
-"""How many stamps in a row must agree before a pause or a jump of the clock is believed."""
-
-NEAR_NS = 1_000_000_000
-"""Stamps nearer than this to the newest one are of no pause or jump, nanoseconds."""
+AGREEING_STAMPS = 5  # in a row, until a pause or a jump of the clock is believed
+NEAR_NS = 1_000_000_000  # stamps nearer than this to the newest one are of no jump
 
 
 YEAR_NS = 365 * 24 * 3600 * NANOSECONDS_PER_SECOND

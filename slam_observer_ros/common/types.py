@@ -12,18 +12,11 @@ from numpy.typing import DTypeLike, NDArray
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-FloatArray: TypeAlias = NDArray[np.float64]
-"""Array of float64; each docstring states shape, unit and frame."""
-
-IntArray: TypeAlias = NDArray[np.int64]
-"""Array of int64: landmark ids, indices, stamps in nanoseconds."""
-
+FloatArray: TypeAlias = NDArray[np.float64]  # docstrings state shape, unit and frame
+IntArray: TypeAlias = NDArray[np.int64]  # landmark ids, indices, stamps in nanoseconds
 BoolArray: TypeAlias = NDArray[np.bool_]  # array of bool: masks over landmarks
 FIRST_AUTOMATIC_ID = 10_000_000  # landmarks whose sensor gives no ids are numbered from here on
-
-LAST_AUTOMATIC_ID = 2**24 - 1
-"""They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
-
+LAST_AUTOMATIC_ID = 2**24 - 1  # up to here, which float32, as in a PointCloud, has exactly
 LEAST_ROOM = 16  # rows for which there is room at first
 
 

@@ -37,9 +37,7 @@ from slam_observer_ros.settings.parameter_table import changed_names, table
 
 Json: TypeAlias = Any  # what json.dumps takes without NaN
 MAX_PATH = 4000  # poses that are drawn, of the path and of its errors
-
-MAX_GROUPS, MIN_GROUP = 150, 10
-"""Points of the curve of NIS, and of how many observations each is the mean at least."""
+MAX_GROUPS, MIN_GROUP = 150, 10  # points of the curve of NIS; each is of so many observations
 
 MAX_RESIDUALS = 6000
 MAX_ELLIPSES = 40_000  # landmarks of all instants together that are drawn
@@ -368,9 +366,7 @@ INDEX = 'index.html'
 
 Line = dict[str, Any]  # a run that is done, as the log has it
 FILES = ('report', 'trajectory')  # what may be written of a run; the line has where, or null
-
-SCORES = tuple(name for name in ACCURACY_ROWS if 'anees' not in name)
-"""Figures whose least value is the best."""
+SCORES = tuple(name for name in ACCURACY_ROWS if 'anees' not in name)  # the least is the best
 
 CONSISTENCY = ('anees', 'configuration_anees', 'nis')
 """Figures that are 1 where all is as stated: a mean of them says less than their range."""

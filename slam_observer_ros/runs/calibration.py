@@ -131,8 +131,7 @@ def _means(
     return of_before, of_after
 
 
-HELD_OUT_SHARE = 1.0 / 3.0
-"""Part of a recording, at its end, that is held out where no other recording is."""
+HELD_OUT_SHARE = 1.0 / 3.0  # part of a recording, at its end, held out where no other is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,11 +235,8 @@ SCALE, RANGE_BIAS_M, BIAS, DELAY_S = 0.1, 0.2, 0.02, 0.3
 """How far scales, of ranges and velocities, all ranges from one landmark, a gyroscope's zero
 (rad/s) and a clock may be off."""
 
-NOISY = 0.05
-"""Share of noise in the velocities, squared, beyond which a known map shows no scale of theirs."""
-
-_PER_MEDIAN = 1.4826
-"""Standard deviation over the median of the absolute value, of normal distributions."""
+NOISY = 0.05  # share of noise in the velocities beyond which a known map shows no scale of theirs
+_PER_MEDIAN = 1.4826  # standard deviation over the median of absolute values, if normal
 
 
 class Driven(NamedTuple):
@@ -338,13 +334,9 @@ def _mean_squares(V: FloatArray, count: int) -> FloatArray:
     return np.asarray((means**2).mean(axis=0))
 
 
-DELAY_STEPS_S = (0.1, 0.05)
-"""Steps by which the delay is searched, and its likelihood's curvature found."""
-
+DELAY_STEPS_S = (0.1, 0.05)  # steps of the search for the delay, and of its curvature
 MOSTLY_NOISE = 0.5  # share of noise in a velocity beyond which nothing moves along its axis
-
-MAX_BEHIND = 0.01
-"""Share of the points so far off the sensor's axis that it does not measure depth along that."""
+MAX_BEHIND = 0.01  # share of points so far off the axis that the sensor measures no depth along it
 
 
 class CalibrationFinder:

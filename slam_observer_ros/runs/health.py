@@ -35,15 +35,9 @@ from slam_observer_ros.lie.matrices import MAX_DEVIATION
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 MAX_REJECTED = 0.1  # share of the points beyond which they are more than a sensor's outliers
-
-MAX_REJECTED_ORIENTATIONS = 0.5
-"""Share of the points beyond which they are more than the flips of small or frontal tags."""
-
-MAX_UNMAPPED = 0.5
-"""Share of the points beyond which they are more than what a map has not got yet."""
-
-MAX_VAGUE = 0.5
-"""Share of the points, stated to be anywhere, beyond which they are what the sensor states."""
+MAX_REJECTED_ORIENTATIONS = 0.5  # … more than the flips of small or frontal tags
+MAX_UNMAPPED = 0.5  # … more than what a map has not got yet
+MAX_VAGUE = 0.5  # … stated to be anywhere, and so what the sensor states
 
 LEFT_OUT = (
     Reason.REJECTED,
@@ -59,19 +53,14 @@ LEFT_OUT = (
 WRONG_IDS = (Reason.REPEATED_ID, Reason.RESERVED_ID, Reason.IMPOSSIBLE_ID)
 """Of those, what a sensor should never give: one is enough to say so."""
 
-NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
-"""Least delay of velocities that is worth a finding, and by how many of its deviations."""
+NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0  # least delay of velocities that is named, and its deviations
 
 SHOWN, SURE = 0.25, 4.0
 """Power of the cosine in ranges, beyond the power of what they are taken for, that is worth a
 finding, and by how many of its deviations."""
 
-HARDLY_ANY = 0.25
-"""Landmarks in a map, over those seen too seldom for it, below which there is hardly a map."""
-
-IMPLAUSIBLE = 4.0
-"""Stated standard deviations by which no calibration is off: something else is wrong."""
-
+HARDLY_ANY = 0.25  # landmarks in a map over those seen too seldom, below which it is hardly one
+IMPLAUSIBLE = 4.0  # stated deviations by which no calibration is off: something else is wrong
 NOTABLY_NOISIER = 1.5  # factor of the noise of the odometry from which it is named as a problem
 
 NOTABLY_WRONG, TOO_WRONG = math.sqrt(1.5), 2.0
@@ -272,9 +261,7 @@ def of_fit(factor: float | None) -> list[Finding]:
     ]
 
 
-RECENT_INNOVATIONS = 300
-"""Observations over which innovations are compared with the noise that is stated."""
-
+RECENT_INNOVATIONS = 300  # observations whose innovations are compared with stated noise
 MIN_DEGREES = 100  # degrees of freedom that it takes to say so; the factor is then known to 7 %
 
 
@@ -350,9 +337,7 @@ SILENT_S = 2.0  # an input without messages for this long is a warning
 MIN_POINTS = 50  # points that it takes to say how large a share of them is rejected
 MANY_EMPTY = 200  # messages without a landmark, that are no detector that waits for one
 MANY_UNUSED = 20  # messages, none of which was used, that are no transient of the start
-
-USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
-"""Inputs, and what their messages are counted as when they are used."""
+USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}  # what inputs count as
 
 
 @dataclass(frozen=True, slots=True)
@@ -527,9 +512,7 @@ class Backlog:
         return fault('slow_node', topic=topic, wait_s=self.wait_s)
 
 
-MIN_PERIOD_S = 2.0
-"""Time over which it is seen how much is dropped: who was busy for a moment does keep up."""
-
+MIN_PERIOD_S = 2.0  # time over which drops are counted: who was busy for a moment does keep up
 MANY_SHED = 0.1  # share of the messages from which on it is reported
 
 
@@ -542,9 +525,7 @@ def overload(topic: str, read: int, shed: int, period_s: float) -> str:
 
 
 SAMPLES = 11  # messages whose median offset is looked at: five stragglers in a row change nothing
-
-FUTURE_NS = 50_000_000
-"""Stamps that are further ahead of their reception can only be of another clock, nanoseconds."""
+FUTURE_NS = 50_000_000  # stamps further ahead of their reception are of another clock
 
 
 class ClockOffset:

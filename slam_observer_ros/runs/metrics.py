@@ -157,9 +157,7 @@ def fit_decay(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> Decay 
     return Decay(float(slope_per_s), float(log10_at_zero))
 
 
-MAX_JOINT = 100
-"""Landmarks whose errors are normalised together, at most: it costs the cube of them."""
-
+MAX_JOINT = 100  # landmarks whose errors are normalised together: it costs the cube of them
 ROUNDING = 1e-13  # share of the total variance that rounding may have left out of a direction
 
 
@@ -246,9 +244,7 @@ def _nees(errors: FloatArray, P: FloatArray) -> float:
     return float(e @ np.linalg.solve(regular, e)) / len(e)
 
 
-MAX_SHARE_OF_ANCHOR = 0.1
-"""ANEES that the anchor's own error may make up at most; 1 is what all errors together have."""
-
+MAX_SHARE_OF_ANCHOR = 0.1  # ANEES that the anchor's own error may make up; all errors together: 1
 _SINGULAR = 1e-12  # eigenvalues of a correlation matrix below this are zero but for rounding
 
 
@@ -340,5 +336,4 @@ def _nees_of_anchor(estimate: Trajectory, covariances: FloatArray) -> float:
     return average_nees(errors, covariances[:, None]) or 0.0
 
 
-CHI_SQUARE_95 = 5.991464547107979
-"""Squared half-axis, in standard deviations, of the ellipse that holds 95 % in a plane."""
+CHI_SQUARE_95 = 5.991464547107979  # squared half-axis, in σ, of the ellipse of 95 % in a plane

@@ -119,8 +119,7 @@ OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 IN_DEGREES = math.radians(1.0)
 
-SIZED = {'linear_scale_stddev': (0.0, 0.0, 0.0)}
-"""A wheel's scale that is estimated would make up for the size of tags."""
+SIZED = {'linear_scale_stddev': (0.0, 0.0, 0.0)}  # a scale of wheels would hide tags' size
 
 AS_IT_IS, AS_SIZED = Correction(''), Correction('', changes=SIZED)
 
@@ -161,17 +160,13 @@ PAIRS = tuple(
 )
 
 ROTATION = (0.1,) * 3  # how far a sensor may be turned against what is stated, rad
-
-USUALLY_TURNED = 0.035
-"""How far brackets are turned as a rule, rad: settings state so, where it matters."""
+USUALLY_TURNED = 0.035  # how far brackets are turned as a rule, rad; settings state it
 
 DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
 """Time of driving, and turns, that are looked at: who stands or goes straight on says little."""
 
 MOST_S = 300.0  # time in all, at most
-
-LONGER = 2.0
-"""How many times as much is looked at where less leaves it open whether a mistake was made."""
+LONGER = 2.0  # times as much is looked at where less leaves open whether a mistake was made
 
 
 def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
@@ -265,9 +260,7 @@ Maps: TypeAlias = LandmarkMap | Sequence[LandmarkMap]
 T = TypeVar('T')
 
 SURE, CLEAR = 25.0, 0.05  # ln of how many times likelier all points must be, and each on average
-
-LIKELIER = math.log(20.0)
-"""The same for all points, of a correction that more of the drive may show to be right."""
+LIKELIER = math.log(20.0)  # of all points, where more of the drive may show a mistake
 
 WEAK = 1.0
 """The same for each point on average, of a mistake that may be a symptom of a pair.
@@ -282,19 +275,14 @@ N gains that are equal, among others that are nothing, have a sum of √N times 
 stretch counts for SURE at most: where a filter is lost, a single one may be worth all others.
 """
 
-NOTABLE_TURN_RAD = 1.0
-"""Turn, by what is seen, that a robot which turns without saying so shows at least."""
-
-UNKNOWN_TURN = 1.0
-"""Noise of a turning that is not known, rad/√s: robots turn by about one radian in a second."""
-
+NOTABLE_TURN_RAD = 1.0  # by what is seen, of a robot that turns without saying so
+UNKNOWN_TURN = 1.0  # noise of an unknown turning, rad/√s: about a radian in a second
 ROUGHLY = 0.2  # deviation of a scale that is known to the next of the sizes that are tried
 
 EARLY, TRIED = 1.0 / 3.0, 3
 """Part of the drive by which corrections are chosen that are tried on the whole, and how many."""
 
-LEAST_TURN_RAD = 1.0
-"""Turn in all that must be left of an angular velocity which is taken for one in degrees."""
+LEAST_TURN_RAD = 1.0  # left in all of an angular velocity that is taken for one in degrees
 
 
 def mistakes(

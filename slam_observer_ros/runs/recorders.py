@@ -110,8 +110,7 @@ class DeadReckoning:
         return self._samples.trajectory
 
 
-FIRST_PERIOD_NS = 250_000_000
-"""Time between two instants at first; it doubles whenever there are too many of them."""
+FIRST_PERIOD_NS = 250_000_000  # between two instants at first; doubled when they are too many
 
 MAX_INSTANTS = 600
 MAX_LANDMARKS_KEPT = 100_000  # landmarks of all instants together
@@ -223,8 +222,7 @@ def _instant(estimator: Estimate, stamp_ns: int) -> Instant:
     )
 
 
-OUTLIERS = 0.02
-"""Share of the points that are taken for outliers: sensors have some per cent of them."""
+OUTLIERS = 0.02  # share of points taken for outliers: sensors have some per cent of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,11 +49,8 @@ logger = logging.getLogger(__name__)
 
 P = ParamSpec('P')
 
-MOST_UNCOMPARED = 64
-"""Observations that are compared with the truth at once: one by one costs three times as much."""
-
-NEES_PERIOD_NS = 5_000_000_000
-"""Time between two covariances of the configuration, nanoseconds: they cost O(n³)."""
+MOST_UNCOMPARED = 64  # observations compared with the truth at once, in a third of the time
+NEES_PERIOD_NS = 5_000_000_000  # between two covariances of the configuration, which cost O(n³)
 
 
 Events: TypeAlias = Iterable[Event | VelocityBlock]
@@ -378,8 +375,7 @@ class _RunningReplay:
             )
 
 
-STILL = 1e-12
-"""Change of a pose, m and rad, below which it is rounding: a robot at rest has no bias."""
+STILL = 1e-12  # change of a pose, m and rad, that is rounding: a robot at rest has no bias
 
 
 def _errors(

@@ -108,13 +108,8 @@ PLACE_THE_SENSOR = (
 MAX_CLOCK_OFFSET_S = ObserverNodeSettings.max_clock_offset
 
 MAX_AHEAD_S = 0.05  # a message can be late, but not early
-
-MAX_SILENCE = 0.1
-"""Share of the time beyond which velocities that are missing are more than a pause."""
-
-MAX_END_SILENCE = 1.0 / 3.0
-"""Share of the time after which landmarks that come no more are more than out of view."""
-
+MAX_SILENCE = 0.1  # share of the time beyond which missing velocities are no mere pause
+MAX_END_SILENCE = 1.0 / 3.0  # share of the time after which landmarks are not just out of view
 FEWEST = 10  # messages that a topic of landmarks has at least if it can be said to have ended
 
 
@@ -255,9 +250,7 @@ MAX_GROWTHS = 3
 GROWTH_SHARE = 0.25  # part of the largest error that a growth must reach to be named
 NOTABLE_GAP_S = 0.5  # time without a used landmark that is named where the error grew
 MAX_ANEES = 1.5  # ANEES beyond which the noise that is stated does not fit
-
-WINDOW_NS = 5 * NANOSECONDS_PER_SECOND
-"""Motions that are compared: long enough that the truth's own noise is small beside theirs."""
+WINDOW_NS = 5 * NANOSECONDS_PER_SECOND  # of motions beside which the truth's noise is small
 
 MIN_WINDOWS = 20
 

@@ -10,10 +10,7 @@ Vector3 = tuple[float, float, float]
 
 
 MAX_DELAY_S = 1.0  # delay of velocities that is made up for at most
-
-ERROR_PROBABILITY = 1e-3
-"""How likely the place where points without id fit in a loaded map may be wrong."""
-
+ERROR_PROBABILITY = 1e-3  # of a wrong place in a loaded map, where points have no ids
 MAX_POSITION_M = 1e7  # coordinate of a given pose at most: a map's origin may be UTM's
 
 

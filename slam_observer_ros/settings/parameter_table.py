@@ -16,12 +16,8 @@ from typing import Any, cast, ClassVar, Protocol, TypeAlias, TypeVar
 
 from slam_observer_ros.common.errors import ParameterError, shown
 
-Value: TypeAlias = bool | int | float | str | tuple[float, ...]
-"""A parameter's value; vectors are tuples of floats."""
-
-
-Pose6: TypeAlias = tuple[float, float, float, float, float, float]
-"""A pose: x y z in metres, and roll pitch yaw in radians."""
+Value: TypeAlias = bool | int | float | str | tuple[float, ...]  # vectors are tuples
+Pose6: TypeAlias = tuple[float, float, float, float, float, float]  # x y z, m; roll pitch yaw
 
 
 class Dataclass(Protocol):
