@@ -106,8 +106,7 @@ def directions_of(lines: FloatArray) -> FloatArray:
     flat = np.maximum(level, _TINY)
     azimuth = np.column_stack([-along[:, 1] / flat, along[:, 0] / flat, np.zeros(len(lines))])
     azimuth[level < _TINY**0.5] = [0.0, 1.0, 0.0]
-    elevation = np.cross(along, azimuth)
-    return np.stack([along, azimuth, elevation], axis=1)
+    return np.stack([along, azimuth, np.cross(along, azimuth)], axis=1)
 
 
 def unmeasured_covariances(directions: FloatArray) -> FloatArray:

@@ -66,8 +66,7 @@ def warn_of_symmetry(loaded: LandmarkMap, name: str) -> None:
 
 def _likeness(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
     """Return how a map is to be moved to look as another, if their ids have not said so."""
-    by_ids = likeness_by_ids(known, other)
-    found = [] if by_ids is not None else turns_onto(known, other)
+    found = turns_onto(known, other) if likeness_by_ids(known, other) is None else []
     return max(found, key=lambda each: int(each.is_same.sum()), default=None)
 
 
@@ -268,8 +267,7 @@ def look_around(
     ``fov_rad`` is its field of view, and ``sigma_m`` the noise of each coordinate; ``map_sigma_m``
     is for landmarks whose file gives none.
     """
-    covariances = known.covariances_or(map_sigma_m)
-    mapped = MappedLandmarks(known.world_points, covariances, axes)
+    mapped = MappedLandmarks(known.world_points, known.covariances_or(map_sigma_m), axes)
     mapped.reach(2.0 * view_m)
     poses = _poses(known.world_points, fov_rad)
     results = []

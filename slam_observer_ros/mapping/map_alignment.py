@@ -277,8 +277,7 @@ CELLS = 40  # along the longer side of a map, free places for one more landmark
 
 def symmetries(known: LandmarkMap) -> list[Likeness]:
     """Return upright turns after which a map looks the same: the best first, then the smallest."""
-    found = turns_onto(known, known)
-    turned = [each for each in found if each.turn_deg > LEAST_TURN_DEG]
+    turned = [each for each in turns_onto(known, known) if each.turn_deg > LEAST_TURN_DEG]
     return sorted(turned, key=lambda each: (-int(each.is_same.sum()), round(each.turn_deg)))
 
 

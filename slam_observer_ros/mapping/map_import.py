@@ -551,8 +551,7 @@ def _fiducial_slam_row(number: int, cells: Sequence[str]) -> Row:
         variance = values[7] or np.nan  # zero of the one that the others are measured from
         if variance < 0.0:
             raise MapError('the variance is negative')
-        covariance = np.diag([variance] * 3)
-        return Row(int(cells[0]), pose[:3, 3], pose[:3, :3], covariance)
+        return Row(int(cells[0]), pose[:3, 3], pose[:3, :3], np.diag([variance] * 3))
 
 
 def _scanner_rows(path: Path) -> list[Row]:

@@ -98,8 +98,7 @@ class Places:
             replace(place, share=float(share))
             for place, share in zip(found, shares[:-1], strict=True)
         ]
-        by_share = sorted(weighed, key=lambda place: -place.share)
-        return cls(by_share, is_complete, log_none)
+        return cls(sorted(weighed, key=lambda place: -place.share), is_complete, log_none)
 
     @classmethod
     def in_several_maps(cls, parts: Mapping[int, Places]) -> Places:

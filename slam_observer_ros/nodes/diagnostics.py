@@ -209,13 +209,10 @@ class DiagnosticsPublisher:
         now_s = time.monotonic()
         if new['observed_point']:
             self._seen_s = now_s
+        unstamped, recent = self._new('unstamped', self._feed.unstamped), self._recent_counts
+        is_paused, has_seen = self._feed.is_paused, self._seen_s is not None
         progress = Progress(
-            dropped,
-            new,
-            self._new('unstamped', self._feed.unstamped),
-            sum(self._recent_counts, Counter()),
-            is_paused=self._feed.is_paused,
-            has_seen=self._seen_s is not None,
+            dropped, new, unstamped, sum(recent, Counter()), is_paused=is_paused, has_seen=has_seen
         )
         unreadable = self._new('malformed', malformed)
         numbers = [
@@ -287,12 +284,6 @@ class DiagnosticsPublisher:
 
     def _faults(self) -> list[str]:
         """Return what inputs, clocks and publishers report of themselves, with what to do."""
-        faults = [
-            *(source.problem for source in self._inputs),
-            *self._feed.clock_problems(),
-            self._estimate_publisher.early_odometry(),
-            self._estimate_publisher.rivals(),
-            self._estimate_publisher.problem,
-            self._node.last_failure,
-        ]
-        return [fault for fault in faults if fault]
+        output, faults = self._estimate_publisher, [source.problem for source in self._inputs]
+        faults += [*self._feed.clock_problems(), output.early_odometry(), output.rivals()]
+        return [fault for fault in [*faults, output.problem, self._node.last_failure] if fault]

@@ -130,23 +130,12 @@ class LoadShedding:
 class InputTopic:
     """Subscribes to a topic, decodes its messages and reports why none come.
 
-    Parameters
-    ----------
-    node : Node
-    name : str
-        Topic name before remapping.
-    decoders : mapping of str to callable
-        From full type names to decoders, the preferred type first. If there is only one, it is
-        subscribed to at once (a ParameterError if its package is not installed); of several, the
-        one that comes on the topic.
-    on_message : callable
-        Called with each decoded message and the ROS time of its reception in nanoseconds.
-    qos : QoSProfile
-        As parameters ``qos_overrides`` of ROS may change it.
-    max_wait_s : float, optional
-        How long messages may wait before only the newest of each sensor is used, seconds; by
-        default all are used.
-
+    ``name`` is before remapping. ``decoders`` are by full type names, the preferred type first: a
+    single one is subscribed to at once (a ParameterError if its package is not installed), of
+    several the one that comes on the topic. ``on_message`` is called with each decoded message and
+    the ROS time of its reception, nanoseconds. ``qos`` is as ``qos_overrides`` of ROS may change
+    it. Messages may wait for ``max_wait_s`` seconds until only the newest of each sensor is used;
+    by default all are.
     """
 
     def __init__(

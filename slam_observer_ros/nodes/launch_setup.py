@@ -116,7 +116,10 @@ def remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
 def command_line(params_file: str, arguments: Mapping[str, str]) -> list[str]:
     """Return the arguments with which the launch file starts the executable."""
     given = {name: default for name, (default, _) in ARGUMENTS.items()} | dict(arguments)
-    chosen = [f'{name}:={_yaml(value)}' for name, value in parameters(given, False).items()]
+    chosen = [  # as YAML has it
+        f'{name}:={str(value).lower() if isinstance(value, bool) else value}'
+        for name, value in parameters(given, False).items()
+    ]
     names = [f'__node:={NAME}', f'__ns:=/{given["namespace"]}']
     names += [f'{name}:={topic}' for name, topic in remappings(given)]
     return [
@@ -126,7 +129,3 @@ def command_line(params_file: str, arguments: Mapping[str, str]) -> list[str]:
         *(word for each in names for word in ('-r', each)),
         *('--log-level', given['log_level']),
     ]
-
-
-def _yaml(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)

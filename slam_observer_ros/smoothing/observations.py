@@ -94,8 +94,7 @@ class SensedPoints:
         arms[half] = completed_lines(arms[half], expected, kinds)
         before = scales * (R @ sensed.arms[half, :, None])[:, :, 0]
         shown, c = replace(sensed, arms=arms), calibrations.shape[1]
-        changed = SensedPoints(shown, *self._of_sensors, c)
-        return changed, before, lines
+        return SensedPoints(shown, *self._of_sensors, c), before, lines
 
     def turns(self, calibrations: FloatArray) -> FloatArray:
         """Return exp(ψ) (M, 3, 3), by which seen orientations are turned."""
