@@ -112,8 +112,7 @@ def definite(S: FloatArray) -> FloatArray:
 def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
     """Kalman update of P, in place, in Joseph's form; return the gain K = P Cᵀ S⁻¹.
 
-    That is (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, with S = C P Cᵀ + R: P stays positive
-    but for rounding.
+    It is (I − K C) P (I − K C)ᵀ + K R Kᵀ, S = C P Cᵀ + R: P is positive but for rounding.
     """
     try:
         K: FloatArray = solve(S, CP).T

@@ -1,7 +1,6 @@
 """Poses T (…, 4, 4), homogeneous matrices (3); twists ξ = (Ω, v) (…, 6), angular part first (9).
 
-A twist here is times a time: rad and m. Point sets are aligned in closed form (Umeyama 1991,
-without scale).
+A twist is times a time: rad and m. Points are aligned in closed form (Umeyama 1991, no scale).
 """
 
 from __future__ import annotations

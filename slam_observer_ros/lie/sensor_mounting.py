@@ -31,8 +31,7 @@ MEASURED = np.array(
     ]
 )
 
-# Standard deviation of a completed point where nothing was measured: as large as a message may
-# state one.
+# Standard deviation of a completed point where not measured: as large as a message may state one.
 UNMEASURED_M = 1e3
 LEAST_M = 0.05  # least distance of a landmark, metres: its sensor has an extent
 _TINY = np.finfo(np.float64).tiny

@@ -153,8 +153,7 @@ def normalise(R: FloatArray) -> FloatArray:
 def exact(R: FloatArray) -> FloatArray:
     """Return rotations (…, 3, 3) that are off by a thousandth at most as rotations.
 
-    What is off by no more than products round remains as it is, bit for bit, and zeros
-    in place of one, too.
+    What is off by no more than products round, or zero, remains as it is, bit for bit.
     """
     off = np.abs(R.swapaxes(-1, -2) @ R - _IDENTITY).max(axis=(-2, -1), keepdims=True)
     near = normalise(normalise(normalise(R)))

@@ -73,8 +73,7 @@ def _likeness(known: LandmarkMap, other: LandmarkMap) -> Likeness | None:
 class Finder:
     """Searches maps for the place where an estimate in a frame of its own is.
 
-    ``rough`` is a pose (4, 4) and its covariance (6, 6) if the place of that frame is roughly
-    known, in whichever map.
+    ``rough`` is a pose (4, 4) and its covariance (6, 6) if that is roughly known, in any map.
     """
 
     def __init__(
@@ -190,8 +189,7 @@ class Finder:
         order = sorted(range(len(self._maps)), key=lambda i: i != best)
         looks, rival = MAX_LOOKS // len(order), -math.inf
         parts: dict[int, Places] = {}
-        # Those searched before the best one may have been left with two places that it makes
-        # unlikely.
+        # Those before the best one may have been left with two places that it makes unlikely.
         for i in [*order, *order[:-1]]:
             if i in parts and rival == _largest_mass(parts[i]):
                 break

@@ -284,8 +284,7 @@ def symmetries(known: LandmarkMap) -> list[Likeness]:
 def turns_onto(known: LandmarkMap, other: LandmarkMap) -> list[Likeness]:
     """Return the turns about the vertical after which a map looks as another, whatever its ids.
 
-    Any of these takes the centre of the landmarks to the other centre, and the outermost landmark
-    to one as far from there.
+    Any of these takes the landmarks' centre to the other, and the outermost to one as far out.
     """
     from scipy.spatial import cKDTree  # which few runs need
 

@@ -2,8 +2,7 @@
 
 Tables are of people and spreadsheets, fiducial_slam's map.txt, and navigation scanners'. In all
 but FRC's fields the axes of a tag are, seen from before the upright tag: x to the right, y up, z
-out of it. So TagSLAM and apriltag_ros have them, and AprilTags are upright as their makers print
-them.
+out of it. So TagSLAM and apriltag_ros have them, and AprilTags are upright as they are printed.
 """
 
 from __future__ import annotations
@@ -115,8 +114,7 @@ def import_map(
     Coordinates and their sigmas are in ``unit``, one of :data:`LENGTHS`, where the file does not
     say; by default metres, unless these look like millimetres. Orientations are from ``tag_axes``,
     one of :data:`TAG_AXES`. What is left out is logged. Raise :exc:`MapError` if it can't be read,
-    is in none of the formats, or has a value that can't be right; the message names the file, the
-    line or tag, and the reason.
+    is in none of the formats, or has a wrong value; it names the file, the line or tag and why.
     """
     left_out: list[str] = []
     try:

@@ -65,8 +65,7 @@ def enter_map(
     )
     wrong = np.setdiff1d(np.append(rows, named), rows[agree])
     _renumber(state, known, rows[agree], known.ids[shared[agree]])
-    # Landmarks that agree are merged, others removed, as are all that the map does not have where
-    # it does not grow, …
+    # Landmarks that agree are merged, others removed, or all where the map does not grow, …
     if state.settings.localization_mode == 'off':
         state.remove(wrong)
     else:

@@ -36,8 +36,7 @@ MAX_ROUNDS = 4  # how often a place is fitted to its matches, and matched again
 RIVALS = 4  # landmarks near a point among which the most likely one is taken
 MAX_VARIANCE_FACTOR = 4.0  # variances may turn out larger than stated: real noise is not white
 
-# Parameters of the beta distribution of f: one point in five is of no landmark, or none, or most
-# of them.
+# Parameters of the beta distribution of f: a point in five is of no landmark, or none, or most.
 FALSE, TRUE = 1.0, 4.0
 NOWHERE = 0.1  # probability beforehand that the robot is not in the map
 LEAST_VIEW_M = 1.0  # radius of what is in view at least, metres

@@ -120,8 +120,7 @@ def decode_point_cloud2(reader: CdrReader) -> ObservationEvent:
     the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s. A cloud without x, y, z
     but with ``range`` is of distances alone, m, with ``range_variance``, m², if it has that; where
     ``no_range`` is not zero x, y, z are a direction of any length. Points that weren't measured,
-    which are NaN or infinite, are left out, whatever id they have, and whether or not the cloud
-    claims to be dense.
+    which are NaN or infinite, are left out, whatever their id, and also of clouds called dense.
     """
     stamp_ns, frame_id = reader.header()
     height, width = reader.uint32(), reader.uint32()

@@ -101,8 +101,7 @@ def observed_poses(
 ) -> ObservationEvent:
     """Return landmarks seen in one frame, at poses (m, 7), position first, or with more (m, 43).
 
-    Covariances (6, 6) come behind the poses then, zero where unknown: the positions' are used if
-    they are known of all.
+    Covariances (6, 6) are behind the poses then, or zero: positions' are used if all are known.
     """
     poses, covariances, turns = values[:, :_POSE], None, None
     if values.shape[1] > _POSE:

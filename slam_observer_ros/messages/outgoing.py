@@ -47,8 +47,7 @@ class OutgoingMessages:
     """Makes messages of rclpy's classes or of rosbags', which have the same fields.
 
     Every float field gets a Python float: rclpy does not check that. ``class_of`` returns the
-    class of a type such as ``geometry_msgs/msg/Pose``, ``octets`` bytes as these classes want them
-    in a field ``uint8[]``.
+    class of a type such as ``geometry_msgs/msg/Pose``, ``octets`` bytes as a field ``uint8[]``.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """Poses, transforms and velocities of ROS messages.
 
-ROS puts linear before angular components; the paper's (9), and all arrays that leave this module,
-put angular first.
+ROS puts linear before angular components; (9) and all arrays that leave here put angular first.
 """
 
 from __future__ import annotations

@@ -34,8 +34,7 @@ from slam_observer_ros.lie.matrices import diagonal_blocks, limited, mahalanobis
 from slam_observer_ros.models.held_velocities import averaged, HeldVelocities
 from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
-# Standard deviations of a velocity beyond which a message only says 'unknown'. No robot turns or
-# moves as fast.
+# Standard deviations of a velocity that only say 'unknown': no robot turns or moves as fast.
 MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
 
 # Standard deviations of a motion in one gap, rad and m: it is as unknown as it can be. More would

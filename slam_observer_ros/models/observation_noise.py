@@ -60,8 +60,7 @@ class ObservationNoise:
 
         What a robot sees from one place has the same error, as light and view stay as they are.
         How slowly that changes nobody knows: it is taken to last for a share of the time for which
-        the robot has stood so far, as flicker noise does. Of its views then only the logarithm of
-        their number counts.
+        the robot has stood so far, as flicker noise does: the logarithm of its views counts.
         """
         return max(self._settings.observation_correlation_time, LASTING * self.stood_s)
 

@@ -2,8 +2,7 @@
 
 A camera that judges distance by apparent size measures r cos b at the angle b off its axis, so
 that ln(range measured / range estimated) = a + q ln cos b with q = 1; a laser has q = 0. The
-standard deviation of q is that by which it scatters over parts of the run, as errors of ranges
-last.
+standard deviation of q is by how much it scatters over parts of the run: errors of ranges last.
 """
 
 from __future__ import annotations

@@ -51,8 +51,7 @@ class VelocityHistory:
     """Velocities in stamp order, joined with the angular velocities of another sensor.
 
     A velocity is held for ``timeout_ns`` at most. Where the other sensor's angular one was older
-    when it came, the velocity's own angular part counts. With ``is_planar`` only parts in the
-    plane z = 0 count.
+    when it came, the velocity's own counts; with ``is_planar``, only parts in the plane z = 0.
     """
 
     def __init__(

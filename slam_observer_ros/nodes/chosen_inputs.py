@@ -133,8 +133,7 @@ class CloudDecoder:
 class OdometryDecoder:
     """Decodes velocities of odometries; warns once if their poses move otherwise.
 
-    ``doubt`` is what is wrong with them: None until it is seen, and, where all were zero, once one
-    is not.
+    ``doubt`` is what is wrong with them: None until it is seen, and, of zeros, until one is none.
     """
 
     def __init__(self, node: Node, uses_turn: bool = True) -> None:

@@ -134,8 +134,7 @@ class InputTopic:
     single one is subscribed to at once (a ParameterError if its package is not installed), of
     several the one that comes on the topic. ``on_message`` is called with each decoded message and
     the ROS time of its reception, nanoseconds. ``qos`` is as ``qos_overrides`` of ROS may change
-    it. Messages may wait for ``max_wait_s`` seconds until only the newest of each sensor is used;
-    by default all are.
+    it. Once messages have waited for ``max_wait_s`` seconds, only each sensor's newest is used.
     """
 
     def __init__(

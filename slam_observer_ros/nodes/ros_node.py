@@ -232,8 +232,7 @@ def _do_nothing(*arguments: Any) -> Any:
 class Entities:
     """Remembers the publishers, subscriptions, services, timers and callbacks a node has now.
 
-    A subscription to the clock is none of them: rclpy itself makes it whenever ``use_sim_time`` is
-    set, and needs it for as long.
+    A subscription to the clock is none of them: rclpy makes it while ``use_sim_time`` is set.
     """
 
     def __init__(self, node: Node) -> None:

@@ -151,8 +151,7 @@ class MapServices:
 
     The node's parameter ``map_path`` names the services' file. ``on_load`` is called after a map
     was loaded: the estimate is in another frame then. Raises a MapError if the map of the start
-    can't be read, or the map of the end could not be written, and a ParameterError if that is to
-    be saved, but not where.
+    can't be read, or the one of the end could not be written, a ParameterError without a file.
     """
 
     def __init__(

@@ -215,8 +215,7 @@ class PoseBroadcaster:
     def hear(self, parent: str, child: str, stamp_ns: int | None) -> None:
         """Take a transform that was heard: nobody else may give the same frame a parent.
 
-        One of /tf_static, which has no stamp here, holds for good, also where it is not known yet
-        what is to go out.
+        One of /tf_static, which has no stamp here, holds for good, also before any goes out.
         """
         parent, child = parent.lstrip('/'), child.lstrip('/')
         if stamp_ns is None:

@@ -93,8 +93,7 @@ class Smoother:
         """Iterate from ``start``; return the last step.
 
         That is the first which moves neither the last pose nor the border by ``tolerance`` (m,
-        rad), or the last of ``iterations``. What a filter would reject has less weight, if
-        ``gated``.
+        rad), or the last of ``iterations``. If ``gated``, what a filter rejects has less weight.
         """
         for _ in range(iterations):
             if len(self._are_half):

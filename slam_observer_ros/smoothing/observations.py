@@ -139,8 +139,7 @@ class Observations:
 
         The q unknowns are the pose in the chain, whose last ``chained`` ones are a calibration,
         and the landmark: its position, then its turn if that is estimated. Without a chained
-        calibration sensors follow. If ``gated``, points that a filter would reject at the solution
-        have less weight.
+        calibration sensors follow. If ``gated``, points that a filter would reject weigh less.
         """
         keyframes, k = self._keyframes, self._axes.point
         R, predicted, error = self._of_points(solution)

@@ -56,8 +56,7 @@ class Prior:
         Return the standard deviation, rad, of the angle by which it may yet turn in these, too. A
         map that the robot has made may turn as a whole and together with the pose, further than
         one may turn against the other: in world coordinates that is an error of second order in
-        the angle. In a loaded map the pose alone may turn. After a blind stretch either may turn
-        far.
+        the angle. In a loaded map the pose alone may turn, after a blind stretch either, and far.
         """
         turns = self._turns(axes)
         together = self._turned_together(axes)
