@@ -446,8 +446,10 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
         if unknown and children[0].parent:
-            still = (child.hypothesis for child in children if not child.parent)
-            self._note_overthrow(next(still, shown), shown.path, event.stamp_ns)
+            still = [child.hypothesis for child in children if not child.parent]
+            if not still:  # it is given up at once
+                shown.cost += pruning_cost(event.ids)
+            self._note_overthrow((still or [shown])[0], shown.path, event.stamp_ns)
         # A way that all of them went sets none of them apart.
         paths = [hypothesis.path for hypothesis in self._all]
         if common := len(_common(paths)):

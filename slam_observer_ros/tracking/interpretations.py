@@ -133,11 +133,15 @@ def _slips_without_ids(
     new_costs: NewCosts,
     found: list[Assignment],
 ) -> list[Interpretation]:
-    """Take the robot for slipped, where more points are new than a slip is unlikely."""
-    new = min((int(np.sum(one.rows < 0)) for one in found), default=len(event.ids))
-    cost = min((new_costs.of(one.rows < 0) for one in found), default=np.inf)
+    """Take the robot for slipped, where more points are new than a slip is unlikely.
+
+    Not where others explain what is seen so well that nothing is ``found`` within their reach, nor
+    where what is found from there passes the gate: that needs no slip.
+    """
+    cost = min((new_costs.of(one.rows < 0) for one in found), default=0.0)
     if cost <= SLIP_COST or not len(state.landmarks):
         return []
+    new = min(int(np.sum(one.rows < 0)) for one in found)
     slips: dict[bytes, Interpretation] = {}
     for other in astray(state):
         for assignment in find_assignments(other, event, new_costs, np.inf, False)[:1]:
@@ -145,7 +149,10 @@ def _slips_without_ids(
             if np.sum(is_new) >= new or taken_for in slips:
                 continue
             taken = _with_ids(state, event, assignment, new_ids).event
-            slipped = _after_slip(state, match(state, taken), taken)
+            matched = match(state, taken)
+            if not rejects(state, matched).any():
+                continue
+            slipped = _after_slip(state, matched, taken)
             if slipped is not None:
                 spared = np.count_nonzero(is_new) * outlier_cost(state) - new_costs.of(is_new)
                 evidence, cost = assignment.evidence, slipped.cost - spared

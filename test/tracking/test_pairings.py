@@ -7,7 +7,7 @@ import itertools
 
 from hypothesis import given
 from hypothesis import strategies as st
-from nameless_points import observe, SPATIAL, stand
+from nameless_points import creep, observe, SPATIAL, stand
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -15,8 +15,9 @@ import pytest
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.filter.robust import huber_loss
+from slam_observer_ros.tracking.assignments import Assignment
 from slam_observer_ros.tracking.costs import NewLandmarks
-from slam_observer_ros.tracking.interpretations import interpretations
+from slam_observer_ros.tracking.interpretations import _slips_without_ids, interpretations
 from slam_observer_ros.tracking.joint_compatibility import (
     columns_of,
     joint_cost,
@@ -123,6 +124,25 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         (only,) = interpretations(state, event, np.arange(3), new_costs, np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
+
+
+def test_a_slip_is_for_what_nothing_else_explains():
+    """All points are 1 m aside: new, a slip, or within reach of the gate or a hypothesis."""
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 1.0], [-3.0, 1.0, 0.0], [2.0, -3.0, 0.5]])
+    estimator = Estimator(SPATIAL)
+    for step in range(10):
+        stand(estimator, 0.1 * step)
+        observe(estimator, 0.1 * step, points)
+    creep(estimator, 1.0)
+    state, ids = estimator._hypotheses.best, 100 + np.arange(4)
+    unknown = np.full(4, UNKNOWN_ID)
+    event = ObservationEvent(estimator.stamp_ns, unknown, points + [1.0, 0.0, 0.0])
+    costs, new = NewCosts(np.full(4, 20.0), np.zeros(4)), Assignment(unknown, np.zeros(4), 80.0)
+    (slip,) = _slips_without_ids(state, event, ids, costs, [new])
+    assert slip.slipped is not None
+    assert not _slips_without_ids(state, event, ids, costs, [])
+    estimator.set_pose(estimator.pose, 4.0 * np.eye(6))
+    assert not _slips_without_ids(state, event, ids, costs, [new])
 
 
 def test_on_new_ground_a_new_landmark_costs_less_and_where_all_is_known_as_much_as_the_gate():
