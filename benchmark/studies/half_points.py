@@ -6,7 +6,8 @@ ranges, which are 7 % long, are so is not known. The data is not shipped: it is 
 in the folder that SLAM_OBSERVER_DATA names.
 
 ``--random 30`` drives through random halls whose landmarks are not known, by each kind, from the
-seed ``--first`` on; ``--straight 50`` straight on past eight landmarks in each of so many.
+seed ``--first`` on, where the ranges of each anchor are too long by ``--bias`` (σ, metres), which
+is another one for each; ``--straight 50`` straight on past eight landmarks in each of so many.
 """
 
 from __future__ import annotations
@@ -86,11 +87,12 @@ def main() -> None:
         ('first', 'the first seed'),
     ):
         parser.add_argument(f'--{name}', type=int, default=0, help=help_)
+    parser.add_argument('--bias', type=float, default=0.0, help='of ranges in halls, σ in metres')
     given = parser.parse_args()
     write_worlds(range(given.first, given.first + given.worlds))
     if given.random or given.straight or given.worlds:
         for kind in (RANGE, BEARING):
-            write_halls(kind, range(given.first, given.first + given.random))
+            write_halls(kind, range(given.first, given.first + given.random), given.bias)
             write_straight(kind, range(given.first, given.first + given.straight))
         return
     for run in (1, 2):
@@ -213,7 +215,12 @@ class Hall:
 
     @classmethod
     def random(
-        cls, seed: int, kind: int, duration_s: float = 200.0, straight: bool = False
+        cls,
+        seed: int,
+        kind: int,
+        duration_s: float = 200.0,
+        straight: bool = False,
+        bias_m: float = 0.0,
     ) -> Hall:
         """Drive from one random place to the next; or ``straight`` on through the middle."""
         rng = np.random.default_rng([seed, kind])
@@ -235,9 +242,11 @@ class Hall:
             range_noise=sigma if kind == RANGE else 0.5,
             bearing_noise=sigma if kind == BEARING else 0.01,
         )
+        biases_m = bias_m * np.random.default_rng(seed).normal(size=n)
         speed = rng.uniform(0.3, 1.0)
         if straight:
-            points, n = rng.uniform([-2.0, -8.0, 0.0], [25.0 * speed + 2.0, 8.0, 0.0], (8, 3)), 8
+            points = rng.uniform([-2.0, -8.0, 0.0], [25.0 * speed + 2.0, 8.0, 0.0], (8, 3))
+            biases_m = np.zeros(8)
             reach_m = np.inf
         heading = rng.uniform(-np.pi, np.pi)
         A = np.eye(4) if straight else pose_of(size[0] / 2.0, size[1] / 2.0, heading)
@@ -266,7 +275,7 @@ class Hall:
                 off = sigma * rng.normal(size=len(rows))
                 shown = np.zeros((len(rows), 3))
                 if kind == RANGE:
-                    shown[:, 0] = ranges_m[rows] * scale + off
+                    shown[:, 0] = ranges_m[rows] * scale + biases_m[rows] + off
                 else:
                     seen_at = angles[rows] + off
                     shown[:, 0], shown[:, 1] = np.cos(seen_at), np.sin(seen_at)
@@ -304,7 +313,7 @@ class Hall:
         return estimator, Trajectory.from_samples(*zip(*poses, strict=True)), float(np.mean(nees))
 
 
-def write_halls(kind: int, seeds: Sequence[int]) -> None:
+def write_halls(kind: int, seeds: Sequence[int], bias_m: float) -> None:
     """Write by how much errors are larger than in a surveyed map, and what has entered.
 
     Errors are at the best size: without a survey odometry alone says it, by its unknown scale.
@@ -312,7 +321,7 @@ def write_halls(kind: int, seeds: Sequence[int]) -> None:
     rows: list[tuple[float, ...]] = []
     entered = wrong = count = 0
     for seed in seeds:
-        hall = Hall.random(seed, kind)
+        hall = Hall.random(seed, kind, bias_m=bias_m)
         known, of_known, _ = hall.drive(is_surveyed=True)
         found, of_found, anees = hall.drive(is_surveyed=False)
         seen = {id_ for e in hall.events if isinstance(e, ObservationEvent) for id_ in e.ids}
