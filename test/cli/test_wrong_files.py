@@ -156,7 +156,8 @@ def test_a_folder_of_figures_is_no_other_output(slam_observer, tmp_path, monkeyp
 
 @pytest.mark.parametrize('only', [(), ('--only', 'noise')])
 def test_what_is_held_out_is_read_before_the_search(slam_observer, recording, monkeypatch, only):
-    monkeypatch.setattr('slam_observer_ros.cli.calibrate._found', None)
+    for search in ('find_noise', 'CalibrationFinder'):
+        monkeypatch.setattr(f'slam_observer_ros.cli.calibrate.{search}', None)
     words = ('calibrate', recording, *only, '--hold-out')
     assert 'nothing.mcap: no such file' in slam_observer.fail(*words, 'nothing.mcap')
     assert 'a recording is given twice' in slam_observer.fail(*words, SAMPLE)
