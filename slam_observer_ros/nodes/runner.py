@@ -101,7 +101,12 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
         node.get_logger().debug('context was shut down')
     finally:
         executor.shutdown()
-        exit_code = _destroy(node)
+        exit_code = 0
+        try:
+            node.destroy_node()
+        except SlamObserverError as error:
+            get_logger('slam_observer_ros').error(str(error))
+            exit_code = 1
         has_ended.set()
     return exit_code
 
@@ -133,13 +138,3 @@ def _watch(node: Node, stop: StopSignal, has_ended: threading.Event) -> None:
         exit_code = node.end_in_haste()
         if exit_code is not None:
             os._exit(exit_code)
-
-
-def _destroy(node: Node) -> int:
-    """End a node; return the exit code."""
-    try:
-        node.destroy_node()
-    except SlamObserverError as error:
-        get_logger('slam_observer_ros').error(str(error))
-        return 1
-    return 0

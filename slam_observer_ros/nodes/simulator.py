@@ -41,11 +41,7 @@ class SimulatorNode(RepeatableParameters):
         declare_settings(self, Scenario, SimulatorNodeSettings)
         self._settings = read_settings(self, SimulatorNodeSettings)
         self._scenario = read_settings(self, Scenario)
-        self._create_publishers()
         self._log = ThrottledLog(self)
-        self._wait_timer = self.create_steady_timer(TICK_S, self._wait)
-
-    def _create_publishers(self) -> None:
         twist_class = TwistStamped if self._settings.stamped else Twist
         is_cloud2 = self._settings.landmarks_type == 'PointCloud2'
         cloud_class = PointCloud2 if is_cloud2 else PointCloud
@@ -58,6 +54,7 @@ class SimulatorNode(RepeatableParameters):
         self._publishes_clock = self._settings.real_time_factor != 1.0
         if self._publishes_clock:
             self._clock_publisher = self.create_publisher(Clock, '/clock', 10)
+        self._wait_timer = self.create_steady_timer(TICK_S, self._wait)
 
     def _wait(self) -> None:
         """Start once the subscribers are there: the biased first sighting must not be missed."""
