@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 import yaml
 
-from slam_observer_ros.cli.calibrate import trades
+from slam_observer_ros.cli.calibrate import state_found, trades
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.lie import so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.mapping.map_file import write_map
 from slam_observer_ros.recordings.writer import RecordingWriter
-from slam_observer_ros.runs.calibration import driven, opened
+from slam_observer_ros.runs.calibration import driven, Found, opened
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import InputSettings
 
 MODEL = {
     'two_d_mode': True,
@@ -182,3 +183,19 @@ def test_only_what_is_little_known_trades():
     assert trade.names == ('linear_scale_x', 'range_scale/camera')
     assert trades([parts[1], scale], together) == []
     assert trades([parts[0], scale], np.eye(2)) == []
+
+
+def test_a_bias_of_one_anchors_ranges_is_found_but_stated_for_no_other():
+    settings, motion = Settings(**MODEL), driven([])
+    assert opened(settings, {}, motion, is_surveyed=True).range_bias_stddev == 0.2
+    assert opened(settings, {}, motion, is_surveyed=False).range_bias_stddev == 0.0
+    scale = CalibrationEstimate('range_scale/radio', 1.05, 0.001, '', 1.0, 0.1)
+    bias = CalibrationEstimate('range_bias/7', 0.21, 0.15, 'm', 0.0, 0.2)
+    together = np.array([[1.0, 0.97], [0.97, 1.0]])
+    found = Found([scale, bias], together, False, False, None, [], [], [])
+    assert found.frames == {'radio'}
+    stated = state_found(settings, InputSettings(), found, None)
+    assert stated.settings.range_scale == 1.05
+    assert stated.settings.range_bias_stddev == settings.range_bias_stddev
+    (trade,) = trades([replace(scale, deviation=0.09), bias], together)
+    assert trade.text.startswith('bias of ranges and range scale trade')
