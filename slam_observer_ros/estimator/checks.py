@@ -47,9 +47,6 @@ MAX_STAMP_NS = 2**63 - 1  # what fits into the integers of numpy
 MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
 
-MAX_TURN, MAX_SPEED = 50.0, 100.0
-"""Velocities beyond which none is believed, rad/s and m/s: gyroscopes measure 35 at most."""
-
 NEARLY = 1.0 - 1e-9
 """Share of a limit below which a value is below the limit, however it is rounded."""
 
@@ -63,7 +60,7 @@ _FLOAT64 = np.dtype(np.float64)
 
 
 def check_event(event: Event, settings: Settings) -> None:
-    """Check an event's shapes and values.
+    """Check an event's shapes and values; the settings limit velocities.
 
     Raises
     ------
@@ -74,13 +71,13 @@ def check_event(event: Event, settings: Settings) -> None:
 
     """
     if isinstance(event, VelocityEvent):
-        if _is_usual(event):
+        if _is_usual(event, settings):
             return
         _check_velocity(event.body_velocity, event.covariance, 6)
-        _check_speed(event.body_velocity)
+        _check_speed(event.body_velocity, settings)
     elif isinstance(event, AngularVelocityEvent):
         _check_velocity(event.angular_velocity, event.covariance, 3)
-        _check_speed(event.angular_velocity)
+        _check_speed(event.angular_velocity, settings)
     elif isinstance(event, ObservationEvent):
         _check_observation(event)
         if settings.use_tag_orientation:
@@ -112,12 +109,13 @@ def are_finite(event: ObservationEvent) -> BoolArray | None:
     return fit if fit.any() else None
 
 
-def check_velocities(velocities: VelocityBlock) -> None:
+def check_velocities(velocities: VelocityBlock, settings: Settings) -> None:
     """Raise :exc:`InvalidEventError` if :func:`check_event` might refuse one of the velocities."""
     body_velocities, covariances = velocities.body_velocities, velocities.covariances
     _check_coordinates('velocities', body_velocities, (len(velocities), 6))
     squares = np.add.reduceat(body_velocities**2, [0, 3], axis=1).max(axis=0)
-    if (squares > NEARLY * np.array([MAX_TURN, MAX_SPEED]) ** 2).any():
+    most = np.array([settings.max_angular_velocity, settings.max_linear_velocity])
+    if (squares > NEARLY * most**2).any():
         raise InvalidEventError('too_fast', 'a velocity is near the greatest that is believed')
     if covariances is not None:
         _check_array('velocity covariances', covariances, (len(velocities), 6, 6))
@@ -210,7 +208,7 @@ def _check_joint(landmark_map: LandmarkMap) -> None:
         raise MapError(f'joint map covariance: {error}') from error
 
 
-def _is_usual(event: VelocityEvent) -> bool:
+def _is_usual(event: VelocityEvent, settings: Settings) -> bool:
     """Return whether nothing is wrong with a velocity, at a tenth of what it costs to say what."""
     V, stamp_ns, receive_ns = event.body_velocity, event.stamp_ns, event.receive_ns
     if event.covariance is not None or type(V) is not np.ndarray:
@@ -222,8 +220,9 @@ def _is_usual(event: VelocityEvent) -> bool:
     if receive_ns is not None and type(receive_ns) is not int:
         return False
     a, b, c, d, e, f = V.tolist()
-    is_slow: bool = a * a + b * b + c * c <= MAX_TURN**2 and d * d + e * e + f * f <= MAX_SPEED**2
-    return is_slow
+    turns_slowly: bool = a * a + b * b + c * c <= settings.max_angular_velocity**2
+    drives_slowly: bool = d * d + e * e + f * f <= settings.max_linear_velocity**2
+    return turns_slowly and drives_slowly
 
 
 def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: int) -> None:
@@ -233,12 +232,15 @@ def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: i
         _check_definite('velocity covariance', covariance)
 
 
-def _check_speed(velocity: FloatArray) -> None:
+def _check_speed(velocity: FloatArray, settings: Settings) -> None:
     """Check a velocity (Ω, v), or Ω alone, against the greatest that a robot can have."""
-    for part, unit, most in ((velocity[:3], 'rad/s', MAX_TURN), (velocity[3:], 'm/s', MAX_SPEED)):
-        size = math.sqrt(part.dot(part))
+    for part, unit, name in (
+        (velocity[:3], 'rad/s', 'max_angular_velocity'),
+        (velocity[3:], 'm/s', 'max_linear_velocity'),
+    ):
+        size, most = math.sqrt(part.dot(part)), getattr(settings, name)
         if size > most:
-            text = f'a velocity of {size:.1f} {unit} is beyond {most:g} {unit}, as no robot moves'
+            text = f'a velocity of {size:.1f} {unit} is beyond {name} ({most:g} {unit})'
             raise InvalidEventError('too_fast', text)
 
 

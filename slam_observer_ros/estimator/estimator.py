@@ -248,7 +248,7 @@ class Estimator(Estimate):
     def _are_usual(self, velocities: VelocityBlock) -> bool:
         """Return whether none of the velocities needs to be looked at for itself."""
         try:
-            check_velocities(velocities)
+            check_velocities(velocities, self.settings)
         except InvalidEventError:
             return False
         return self._queue.follow(velocities)

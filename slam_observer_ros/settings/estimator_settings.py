@@ -51,6 +51,12 @@ class Settings:
     max_stamp_jump: float = parameter(
         10.0, 'A stamp further ahead of all others is refused until others confirm it',
         unit='s', minimum=0.1, maximum=1e9)
+    max_linear_velocity: float = parameter(
+        100.0, 'Speed beyond which a velocity is refused (too_fast)',
+        unit='m/s', minimum=1e-3, maximum=1e6, read_only=False)
+    max_angular_velocity: float = parameter(
+        50.0, 'Rate of turn beyond which a velocity is refused (too_fast)',
+        unit='rad/s', minimum=1e-3, maximum=1e6, read_only=False)
     on_time_jump: str = parameter(
         'reset', 'When the clock jumps, as in a looped recording: reset forgets the run, hold '
         'keeps pose and map', choices=('reset', 'hold'))

@@ -103,14 +103,16 @@ def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason,
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 @pytest.mark.parametrize('dtype', [np.float64, np.float32])
 def test_what_is_as_large_as_may_be_is_taken_and_what_is_larger_refused(sign, dtype):
+    settings = Settings(max_linear_velocity=MAX_MEASURED, max_angular_velocity=MAX_MEASURED)
     for size, is_taken in ((MAX_MEASURED, True), (1.001 * MAX_MEASURED, False)):
         entries = np.array([0.0, sign * size, 0.0], dtype=dtype)
-        estimator, ids = Estimator(Settings()), np.array([1])
+        estimator, ids = Estimator(settings), np.array([1])
+        assert estimator.add(VelocityEvent(START_NS, np.tile(entries, 2))) == is_taken
         assert estimator.add(ObservationEvent(START_NS, ids, entries[None])) == is_taken
         velocities = entries[None] * np.ones((1, 3), dtype=dtype)
         moving = ObservationEvent(START_NS + 1, ids, np.ones((1, 3)), None, velocities)
         assert estimator.add(moving) == is_taken
-        assert estimator.dropped == ({} if is_taken else {'too_large': 2})
+        assert estimator.dropped == ({} if is_taken else {'too_large': 3})
 
 
 def test_a_velocity_that_no_robot_has_is_refused_counted_and_named(caplog):
@@ -125,11 +127,12 @@ def test_a_velocity_that_no_robot_has_is_refused_counted_and_named(caplog):
     assert not estimator.add(VelocityEvent(stamp_ns, turning))
     assert not estimator.add(AngularVelocityEvent(stamp_ns, turning[:3]))
     assert estimator.dropped == {'too_fast': 3}
-    assert 'a velocity of 500.0 m/s is beyond 100 m/s, as no robot moves' in caplog.text
+    assert 'a velocity of 500.0 m/s is beyond max_linear_velocity (100 m/s)' in caplog.text
     estimator.flush()
     untouched.flush()
     assert_same_state(estimator, untouched)
-    assert Estimator(Settings()).add(VelocityEvent(stamp_ns, 0.2 * fast + 0.8 * turning))
+    settings = Settings(max_linear_velocity=600.0, max_angular_velocity=61.0)
+    assert Estimator(settings).add(VelocityEvent(stamp_ns, fast + turning))
 
 
 @pytest.mark.filterwarnings('error')

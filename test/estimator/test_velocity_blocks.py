@@ -152,6 +152,7 @@ def assert_same_samples(one, other):
             'linear_scale_noise': st.just((0.1, 0.1, 0.1)),
             'linear_scale_stddev': st.just((0.02, 0.0, 0.0)),
             'on_time_jump': st.just('hold'),
+            'max_linear_velocity': st.just(1.0),
         },
     ),
 )
