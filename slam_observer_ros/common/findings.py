@@ -63,7 +63,8 @@ INPUTS = (
 
 _TEXTS = {
     # What of the inputs was used
-    'nothing_used': 'nothing was used, neither a velocity nor an observation (dropped: {dropped}) '
+    'nothing_used':
+        'nothing was used, neither a velocity nor an observation (dropped: {dropped}) '
         '→ see why it was dropped (Troubleshooting)',
     'no_velocity': 'no velocity was used (dropped: {dropped}): the landmarks alone move the robot '
         '→ see why they were dropped (Troubleshooting)',
@@ -349,7 +350,8 @@ FAULTS = {
     # The inputs of a node
     'nothing_published': "nothing publishes on '{topic}' ({wanted} is needed)",
     'other_type': "'{topic}' carries {types}; {wanted} is needed{hint}",
-    'other_quality': "'{node}' can't be heard on '{topic}', its quality of service does not fit: "
+    'other_quality':
+        "'{node}' can't be heard on '{topic}', its quality of service does not fit: "
         '{reason}',
     'missing_package': "'{topic}' can't be heard: {error}",
     'no_message_yet': "no message yet on '{topic}' ({wanted})",

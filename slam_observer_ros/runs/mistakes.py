@@ -22,6 +22,7 @@ from slam_observer_ros.common.findings import Finding, found, muted_warnings
 from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, Update
+from slam_observer_ros.estimator.checks import MAX_MEASURED
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -180,7 +181,9 @@ def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
             break
         drive.add(event)
         if isinstance(event, ObservationEvent):
-            usable = event.ids != UNKNOWN_ID
+            size = np.abs(event.points).max(axis=1, initial=0.0)
+            # What sensors write for 'none' says how far no other point may be.
+            usable = (event.ids != UNKNOWN_ID) & (size > 0.0) & (size <= MAX_MEASURED)
             if event.kinds is not None:
                 usable &= event.kinds == POINT
             event = event.select(usable)

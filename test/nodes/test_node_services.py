@@ -289,7 +289,8 @@ class Publishing:
         self.node.get_clock.return_value.now.return_value.to_msg.return_value = Time()
         self.dropped = Counter()
         self.estimator = SimpleNamespace(
-            counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
+            counts=Counter(), dropped=self.dropped, last_update=None,
+            landmark_ids=np.array([], dtype=np.int64),
             calibration=[], motion_factors=[], undisturbed=([], []), lyapunov=0.0, stamp_ns=None,
             has_rare_velocities=False, velocity_period_s=0.05, distrust_odometry=Mock(),
             anchor_biases={}, open_sides=[],

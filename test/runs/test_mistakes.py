@@ -47,6 +47,17 @@ def test_how_a_sensor_is_mounted_is_named_where_it_is_more_than_brackets_usually
     assert all('further to the left' in each.what for each in findings)
 
 
+@pytest.mark.parametrize('size', [0.0, np.nan, np.inf, 1e300])
+def test_what_sensors_write_for_no_point_at_all_names_and_ends_nothing(size):
+    events = [
+        replace(event, points=np.full_like(event.points, size))
+        if isinstance(event, ObservationEvent)
+        else event
+        for event in drive(seconds=15.0)
+    ]
+    assert mistakes(SETTINGS, events) == mistakes(SETTINGS, events, of_mount_only=True) == []
+
+
 def test_who_goes_straight_on_does_not_turn_in_degrees():
     """Undoing that takes the noise of the turning away, which is stated too small."""
     settings = replace(SETTINGS, angular_velocity_noise=(0.0, 0.0, 0.02 / 3.0))

@@ -19,7 +19,10 @@ LIVE = [row for row in table(Settings) if not row.read_only]
 NOISE = [row for row in LIVE if row.name.endswith('_noise')]
 """Counts for what comes after a change, so no other estimator is the same right behind it."""
 
-OTHERS = [row for row in LIVE if row not in NOISE]
+LIMITS = [row for row in LIVE if row.name.startswith('max_') and row.name.endswith('_velocity')]
+"""Which velocities are refused, so that no state is affected by those that are not."""
+
+OTHERS = [row for row in LIVE if row not in NOISE + LIMITS]
 
 AFFECTED_BY = {
     'constant': {'gain_k', 'gain_l', 'step_mode', 'max_innovation_time'},
@@ -106,6 +109,15 @@ def split_before_observation(events, number):
     """The events before the observation of that number, and the rest."""
     seen = [i for i, event in enumerate(events) if isinstance(event, ObservationEvent)]
     return events[: seen[number]], events[seen[number] :]
+
+
+def test_a_changed_limit_refuses_velocities_from_then_on():
+    estimator = Estimator(Settings())
+    assert estimator.add(VelocityEvent(0, np.full(6, 2.0)))
+    for number, row in enumerate(LIMITS, 1):
+        estimator.change_settings(replace(Settings(), **{row.name: 3.0}))
+        assert not estimator.add(VelocityEvent(number, np.full(6, 2.0)))
+    assert estimator.dropped['too_fast'] == len(LIMITS) == 2
 
 
 def test_every_live_setting_affects_some_filter():
