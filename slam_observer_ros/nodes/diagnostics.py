@@ -37,7 +37,7 @@ from slam_observer_ros.runs.health import (
     of_node,
     Progress,
 )
-from slam_observer_ros.runs.mistakes import Drive, leaves_mount_open, Search
+from slam_observer_ros.runs.mistakes import Drive, LEAST_DRIVEN_S, leaves_mount_open, Search
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 FOUND_AGAIN = 0.8  # of the error level: near it the robot would be lost and found all the time
@@ -102,7 +102,6 @@ class LocalisationStatus:
 
 
 WINDOW_NS, MOST_EVENTS = to_ns(60.0), 20_000  # time, and events, of late that are looked at
-LEAST_DRIVEN_S = 20.0  # seconds of driving that say something: a minute leaves time to search them
 PERIOD_S, SLICE_S = 0.03, 0.01  # how often a search goes on, and how long: no message waits for it
 
 # Time between the starts of two searches, at most: before, most of the events are the same. Where

@@ -167,6 +167,7 @@ DRIVE_S, TURNED_RAD = 90.0, 4.0 * math.pi
 """Time of driving, and turns, that are looked at: who stands or goes straight on says little."""
 
 MOST_S = 300.0  # time in all, at most
+LEAST_DRIVEN_S = 20.0  # seconds of driving that say something where nothing looks wrong
 LONGER = 2.0  # times as much is looked at where less leaves open whether a mistake was made
 
 
@@ -375,7 +376,7 @@ class _Trial:
 
     def mount(self) -> Steps[list[Finding]]:
         """Return how a sensor is turned further than brackets are, if points are likelier so."""
-        if not self.sees_any():
+        if not self.sees_any() or Drive(self.events).driven_s < LEAST_DRIVEN_S:
             return []
         open_mount = Correction('', changes={'sensor_rotation_stddev': ROTATION})
         turned = yield from self.score(open_mount)

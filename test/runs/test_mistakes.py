@@ -24,7 +24,8 @@ ALIKE = 'points_mirrored', 'driving_negated'
 
 @pytest.mark.parametrize('kind', [kind for kind in MADE if kind not in (*ALIKE, 'tag_size')])
 def test_a_mistake_that_was_made_is_named(kind):
-    assert kind in named(list(MADE[kind].apply(drive())))
+    seconds = 25.0 if kind == 'mount_off' else 20.0
+    assert kind in named(list(MADE[kind].apply(drive(seconds=seconds))))
 
 
 @pytest.mark.parametrize(('factor', 'false'), [(1.0 / 3.0, 0.1), (1.0, 0.0), (3.0, 0.1)])
@@ -42,7 +43,8 @@ def test_how_a_sensor_is_mounted_is_named_where_it_is_more_than_brackets_usually
     turned_deg, kinds
 ):
     R = so3.exp(np.array([0.0, 0.0, np.radians(turned_deg)]))
-    findings = mistakes(SETTINGS, Correction('', R).apply(drive()), of_mount_only=True)
+    events = Correction('', R).apply(drive(seconds=25.0))
+    findings = mistakes(SETTINGS, events, of_mount_only=True)
     assert [each.kind for each in findings] == kinds
     assert all('further to the left' in each.what for each in findings)
 
