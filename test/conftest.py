@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 from collections.abc import Iterator
 from contextlib import suppress
+import logging
 import os
 from pathlib import Path
 import shutil
@@ -119,6 +120,17 @@ def ros_domain_id() -> Iterator[int]:
         domain_id = next(i for i in DOMAIN_IDS if reserve(reservation, i))
         patch.setenv('ROS_DOMAIN_ID', str(domain_id))
         yield domain_id
+
+
+@pytest.fixture(scope='module', autouse=True)
+def log_as_before() -> Iterator[None]:
+    """Take back what a module's nodes and libraries have made of the log's levels."""
+    loggers = [logging.getLogger(name) for name in (None, 'slam_observer_ros')]
+    before = [(logger.level, logger.handlers) for logger in loggers]
+    yield
+    for logger, (level, handlers) in zip(loggers, before, strict=True):
+        logger.setLevel(level)
+        logger.handlers = handlers
 
 
 @pytest.fixture(scope='module')
