@@ -20,7 +20,7 @@ import numpy as np
 
 from slam_observer_ros.common.findings import Finding, found, muted_warnings
 from slam_observer_ros.common.stamps import to_ns, to_s
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, Update
 from slam_observer_ros.estimator.checks import MAX_MEASURED
 from slam_observer_ros.estimator.estimator import Estimator
@@ -182,14 +182,17 @@ def first_drive(events: Iterable[Event], part: float = 1.0) -> list[Event]:
             break
         drive.add(event)
         if isinstance(event, ObservationEvent):
-            size = np.abs(event.points).max(axis=1, initial=0.0)
-            # What sensors write for 'none' says how far no other point may be.
-            usable = (event.ids != UNKNOWN_ID) & (size > 0.0) & (size <= MAX_MEASURED)
-            if event.kinds is not None:
-                usable &= event.kinds == POINT
-            event = event.select(usable)
+            event = event.select(judgeable(event))
         kept.append(event)
     return kept
+
+
+def judgeable(event: ObservationEvent) -> BoolArray:
+    """Return by which of its points (m,) mistakes are judged: whole ones with ids."""
+    size = np.abs(event.points).max(axis=1, initial=0.0)
+    # What sensors write for 'none' says how far no other point may be.
+    usable: BoolArray = (event.ids != UNKNOWN_ID) & (size > 0.0) & (size <= MAX_MEASURED)
+    return usable if event.kinds is None else usable & (event.kinds == POINT)
 
 
 def in_blocks(events: Iterable[Event]) -> Iterator[Event | VelocityBlock]:
@@ -376,7 +379,9 @@ class _Trial:
 
     def mount(self) -> Steps[list[Finding]]:
         """Return how a sensor is turned further than brackets are, if points are likelier so."""
-        if not self.sees_any() or Drive(self.events).driven_s < LEAST_DRIVEN_S:
+        if not (leaves_mount_open(self.settings) and self.sees_any()):
+            return []
+        if Drive(self.events).driven_s < LEAST_DRIVEN_S:
             return []
         open_mount = Correction('', changes={'sensor_rotation_stddev': ROTATION})
         turned = yield from self.score(open_mount)

@@ -39,7 +39,7 @@ from slam_observer_ros.runs.metrics import (
     trajectory_errors,
     TrajectoryErrors,
 )
-from slam_observer_ros.runs.mistakes import leaves_mount_open, mistakes
+from slam_observer_ros.runs.mistakes import judgeable, LEAST_DRIVEN_S, leaves_mount_open, mistakes
 from slam_observer_ros.runs.recorders import DeadReckoning, NisTally, PoseSamples, RunRecorder
 from slam_observer_ros.runs.result import Replay, Request, Result, SmoothedRun
 from slam_observer_ros.runs.run_health import judged, of_use, unused_messages
@@ -82,7 +82,10 @@ def result_of(
 
         def look_for_mistakes(of_mount_only: bool = False) -> list[Finding]:
             """Read the recording again, and look whether a mistake of the set-up explains it."""
-            if of_mount_only and not leaves_mount_open(settings):
+            estimator, may_be_mount = run.estimator, leaves_mount_open(settings)
+            if not estimator.jumps:
+                may_be_mount &= run.seconds_until(estimator.stamp_ns or 0) >= LEAST_DRIVEN_S
+            if not run.has_points or (of_mount_only and not may_be_mount):
                 return []
             with muted_warnings(), Recording(request.recording) as again:
                 events = again.events(selected, inputs, settings.velocity_timeout)
@@ -250,7 +253,7 @@ class _RunningReplay:
         self._pose_truth = truth.trajectory if truth else None
         self._landmark_tracks = truth.tracks if truth else None
         self._events = self._observations = self._used_points = self._angular_velocities = 0
-        self._seconds = 0.0
+        self._seconds, self._has_points = 0.0, False
         self._clear_figures()
 
     def _clear_figures(self) -> None:
@@ -271,6 +274,7 @@ class _RunningReplay:
             return
         if isinstance(event, ObservationEvent):
             self._ranges.note_event(event)
+            self._has_points = self._has_points or bool(judgeable(event).any())
         start_s = time.thread_time()
         if isinstance(event, VelocityBlock):
             self._events += len(event)
@@ -298,6 +302,7 @@ class _RunningReplay:
             start_ns=self._start_ns or 0,
             localised_ns=self._localised_ns,
             range_power=self._ranges.power,
+            has_points=self._has_points,
             observations=self._observations,
             angular_velocities=self._angular_velocities,
         )

@@ -140,6 +140,7 @@ class Replay:
     start_ns: int  # stamp of the first event that was used; 0 if none was
     localised_ns: tuple[int, int] | None  # first and last stamp at which the final frame was known
     range_power: RangePower | None  # how ranges grow with the cosine off the sensor's axis
+    has_points: bool  # by which mistakes are judged: whole ones with ids
     observations: int  # with points that were used
     angular_velocities: int  # of an Imu, that were taken in
 

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 from mistaken_drives import drive, MADE, SETTINGS, surveyed
+import numpy as np
 import pytest
 from recordings import write_events
 
 from slam_observer_ros.cli.main import main
 from slam_observer_ros.common.findings import MISTAKES, SYMPTOMS
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import ObservationEvent, POINT, RANGE, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.mapping.map_file import write_map
 from slam_observer_ros.recordings.writer import RecordingWriter
+from slam_observer_ros.runs import replay
 
 OPTIONS = ('--config', 'wheeled_robot', '--set', 'bearing_noise=0.01')
 
@@ -50,6 +53,33 @@ def test_where_all_is_right_none_is_named(tmp_path, capsys, known):
     for arguments in (['replay', path, *OPTIONS], ['doctor', path, '--load-map', known]):
         assert main([*arguments, '--json']) == 0
         assert not kinds(capsys.readouterr().out) & MISTAKES
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'field', 'value', 'stddev', 'is_read_again'),
+    [
+        (22.0, 'kinds', POINT, 0.0, True),
+        (15.0, 'kinds', POINT, 0.0, False),  # too short a drive
+        (22.0, 'kinds', POINT, 0.1, False),  # it is estimated
+        (22.0, 'kinds', RANGE, 0.0, False),
+        (22.0, 'ids', UNKNOWN_ID, 0.0, False),
+    ],
+)
+def test_a_recording_is_read_again_only_where_a_mount_may_be_named(
+    tmp_path, monkeypatch, seconds, field, value, stddev, is_read_again
+):
+    looked = Mock(return_value=[])
+    monkeypatch.setattr(replay, 'mistakes', looked)
+    events = [
+        replace(event, **{field: np.full_like(event.ids, value)})
+        if isinstance(event, ObservationEvent)
+        else event
+        for event in drive(seconds=seconds)
+    ]
+    path = write_events(tmp_path / 'run.mcap', events)
+    mount = f'sensor_rotation_stddev=[0.0,0.0,{stddev}]'
+    assert main(['replay', str(path), *OPTIONS, '--set', mount]) == 0
+    assert looked.called == is_read_again
 
 
 def test_where_a_parameter_file_does_not_fit_no_size_is_named(capsys):

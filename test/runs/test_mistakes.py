@@ -49,6 +49,11 @@ def test_how_a_sensor_is_mounted_is_named_where_it_is_more_than_brackets_usually
     assert all('further to the left' in each.what for each in findings)
 
 
+def test_a_mount_that_is_estimated_is_not_named():
+    settings = replace(SETTINGS, sensor_rotation_stddev=(0.0, 0.0, 0.1))
+    assert named(list(MADE['mount_off'].apply(drive(seconds=25.0))), settings) == []
+
+
 @pytest.mark.parametrize('size', [0.0, np.nan, np.inf, 1e300])
 def test_what_sensors_write_for_no_point_at_all_names_and_ends_nothing(size):
     events = [
