@@ -269,13 +269,18 @@ def _tagslam_row(
         if noise is None:
             return Row(tag['id'], pose[:3, 3], pose[:3, :3], UNKNOWN_NOISE)
         R, position = pose[:3, :3], pose[:3, 3]
-        turn, shift = (R @ np.diag(part**2) @ R.T for part in (noise[:3], noise[3:]))
+        turn, shift = _turned(R, noise)
         if body_noise is not None:
-            B, arm = in_map[:3, :3], so3.hat(position - in_map[:3, 3])
-            of_body = [B @ np.diag(part**2) @ B.T for part in (body_noise[:3], body_noise[3:])]
-            turn = turn + of_body[0]
-            shift = shift + of_body[1] + arm @ of_body[0] @ arm.T
+            arm = so3.hat(position - in_map[:3, 3])
+            body_turn, body_shift = _turned(in_map[:3, :3], body_noise)
+            turn, shift = turn + body_turn, shift + body_shift + arm @ body_turn @ arm.T
         return Row(tag['id'], position, R, shift, float(np.sqrt(np.trace(turn) / 3.0)))
+
+
+def _turned(R: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return covariances (3, 3) of turn and shift, of deviations (6,) along axes turned by R."""
+    turn, shift = (R @ np.diag(part**2) @ R.T for part in np.split(sigmas, 2))
+    return turn, shift
 
 
 def _tagslam_pose(written: Mapping[str, Any] | None) -> FloatArray:

@@ -101,7 +101,8 @@ def joint_covariance(
     if is_own_frame:
         G = axes.output_matrix(points - points.mean(axis=0)).reshape(-1, axes.p)
         G = np.vstack([G, np.tile(np.eye(axes.turn, axes.p), (len(tags), 1))])
-        L = without_frame(L, G)
+        Q = orth(solve_triangular(L, G, lower=True, check_finite=False), RANK_TOLERANCE)
+        L = L - (L @ Q) @ Q.T
     of_points, of_turns = np.split(L, [m * axes.point])
     root = np.zeros((m + len(tags), 3, len(L)))
     root[:m, : axes.point] = of_points.reshape(m, axes.point, len(L))
@@ -109,12 +110,6 @@ def joint_covariance(
     world_root = (state.observer.reference_pose[:3, :3] @ root).reshape(-1, len(L))
     world: FloatArray = world_root @ world_root.T
     return world
-
-
-def without_frame(L: FloatArray, G: FloatArray) -> FloatArray:
-    """Return a root of P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, of L Lᵀ = P: what is known of a shape alone."""
-    Q = orth(solve_triangular(L, G, lower=True, check_finite=False), RANK_TOLERANCE)
-    return np.asarray(L - (L @ Q) @ Q.T)
 
 
 def _lower_root(P: FloatArray) -> FloatArray:

@@ -38,7 +38,7 @@ class Equations(NamedTuple):
     above: FloatArray  # (S − 1, d, d) blocks of T that link poses s and s + 1
     shared: FloatArray  # (S, d, c) blocks of B that link poses to the border's first c unknowns
     poses: IntArray  # (M,) which pose saw …
-    landmarks: IntArray  # (M,) … which landmark; no two are the same
+    landmarks: IntArray  # (M,) … which landmark; of two that were merged, maybe twice
     seen: FloatArray  # (M, d, k) blocks of B that link the two
     first: FloatArray  # (d, b) the prior's blocks, which link the first pose to the border
     corner: FloatArray  # (b, b) D
@@ -114,7 +114,7 @@ class _InNumpy:
         # Bᵀ (b, S, d), and below it the gradient
         rows = np.zeros((b + 1, S, d))
         columns = landmark_columns(equations.landmarks, c, k)
-        rows[columns, equations.poses[:, None]] = transpose(equations.seen)
+        np.add.at(rows, (columns, equations.poses[:, None]), transpose(equations.seen))
         rows[:c] += equations.shared.transpose(2, 0, 1)
         rows[:b, 0] += equations.first.T
         rows[b] = equations.gradient

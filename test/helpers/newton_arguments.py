@@ -76,8 +76,8 @@ def any_equations(rng):
     k = int(rng.integers(2, 4))
     d, c = (3, 6)[k - 2] + up_to(rng, 19) - 1, up_to(rng, 63) - 1
     S, n, M = up_to(rng, 500), up_to(rng, 200), up_to(rng, 400)
-    poses, landmarks = np.divmod(np.sort(rng.permutation(S * n)[:M]), n)
-    M, b = len(poses), c + k * n
+    poses, landmarks = np.divmod(np.sort(rng.integers(0, S * n, M)), n)  # some more than once
+    b = c + k * n
 
     def linked(*shape):
         return rng.normal(scale=0.1 / np.sqrt(d), size=shape)
