@@ -195,7 +195,8 @@ class McapRecords:
         if self.by_indexes and piece.is_chunk:
             heads = _index_entries(data, piece.end)
             times_ns = _CHUNK_TIMES.unpack_from(data, piece.begin)
-            if times_ns != (heads['stamp_ns'].min(), heads['stamp_ns'].max()):
+            stamps_ns = heads['stamp_ns'] if len(heads) else np.zeros(1)
+            if times_ns != (stamps_ns.min(), stamps_ns.max()):
                 raise ValueError('the index is wrong')
         else:
             _, _, heads = content_of(data, piece, self._take_description)

@@ -100,7 +100,10 @@ def test_a_file_is_opened_without_decompressing_it_and_each_chunk_is_once_when_i
         'get_chunk_data_stream',
         lambda chunk, **options: chunks.append(chunk) or decompress(chunk, **options),
     )
-    source = mcap_source.McapSource(write(tmp_path / 'run.mcap'))
+    path = write(tmp_path / 'run.mcap')
+    data, empty = path.read_bytes(), bytes(40)  # a chunk without messages
+    path.write_bytes(data[:8] + struct.pack('<BQ', Opcode.CHUNK, len(empty)) + empty + data[8:])
+    source = mcap_source.McapSource(path)
     assert not chunks
     assert sum(topic.count for topic in source.topics) == len(list(source.messages(source.topics)))
     assert len(chunks) == len({chunk.data for chunk in chunks}) > 3
