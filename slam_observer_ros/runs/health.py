@@ -389,11 +389,10 @@ def of_node(
         if not each.problem and each.silent_s > SILENT_S
     ]
     place = rule(not estimator.is_localised, 'unknown_pose')
-    problem = estimator.localisation_problem
     # Landmarks that came without an id have one that was given here.
-    is_by_place = is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)
-    if place and problem and is_by_place:
-        place.append(problem)
+    if place and (is_automatic(estimator.landmark_ids).any() or len(estimator.possible_poses)):
+        problem = estimator.localisation_problem
+        place += [problem] if problem else []
     dropped = rule(progress.is_paused, 'paused')
     # What came while the node was paused or inactive was not to be used.
     if total and not progress.is_paused:
