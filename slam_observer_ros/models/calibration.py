@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 MOVES = 6  # column of b in [M b] (6, 7), which is multiplied by 1 where a velocity is not zero
-# Where τ is behind [M b], row by row, and behind it ``EACH`` values of each sensor, and one value
-# of each landmark whose ranges have a bias.
-DELAY, SENSORS, EACH = 42, 43, 7
+# Where τ is, behind [M b] row by row. Then come, as they are first seen, ``EACH`` values of each
+# sensor, and one of each landmark whose ranges have a bias.
+DELAY, EACH = 42, 7
 
 # Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier. How
 # the robot moves so much later is not known yet when it is needed: without a limit the estimate,
@@ -108,9 +108,8 @@ class Calibration:
         errors, is_possible = _of_velocity(settings, '_stddev'), np.zeros((6, 7))
         is_possible[axes.pose, axes.pose] = is_possible[axes.pose, MOVES] = 1.0
         errors[:DELAY] *= is_possible.ravel()
-        self.velocity_places: IntArray = np.array(
-            [entry.place for entry in OF_VELOCITY if errors[entry.place] > 0.0], dtype=np.int64
-        )
+        self._entries = [entry for entry in OF_VELOCITY if errors[entry.place] > 0.0]
+        self.velocity_places: IntArray = np.array([e.place for e in self._entries], dtype=np.int64)
         rates = self.velocity_places[self.velocity_places < DELAY]
         self._rows, self._columns = rates // 7, rates % 7
         stated, deviations = _of_a_sensor(settings)
@@ -129,9 +128,6 @@ class Calibration:
         self.of_velocity = len(self.velocity_places)  # how many of the c are no sensor's
         # (c,) which of the values these are, and all as they were at the start
         self._places, self._nominal = self.velocity_places, stated_of_velocity(settings)
-        self._names = tuple(
-            (entry.name, entry.unit) for entry in OF_VELOCITY if errors[entry.place] > 0.0
-        )
         owner.calibration = self._nominal.copy()
         self._set_variances(errors[self._places] ** 2)
 
@@ -153,14 +149,15 @@ class Calibration:
         """
         if isinstance(of, str):
             stated, estimated, variances = self._stated, self.of_sensor, self._sensor_variances
-            entries = [(OF_SENSOR[each].name, OF_SENSOR[each].unit) for each in estimated]
+            entries = [OF_SENSOR[each] for each in estimated]
             self.sensors = (*self.sensors, of)
         else:
             stated, estimated, variances = np.zeros(1), np.zeros(1, int), self._bias_variance
-            entries = [(BIAS_OF_RANGES.name, BIAS_OF_RANGES.unit)]
+            entries = [BIAS_OF_RANGES]
         owner, first = self._owner, len(self._nominal)
         self._begins = {**self._begins, of: (first, self.count)}
-        self._names += tuple((f'{name}/{of}' if of != '' else name, u) for name, u in entries)
+        named = [each._replace(name=f'{each.name}/{of}') if of != '' else each for each in entries]
+        self._entries = [*self._entries, *named]  # a copy has the list, too
         self._places = np.append(self._places, first + estimated)
         self._nominal = np.append(self._nominal, stated)
         owner.calibration = np.append(owner.calibration, stated)
@@ -197,10 +194,9 @@ class Calibration:
         _, first = self._begins[frame]
         return slice(first, first + len(self.of_sensor))
 
-    def without_bias(self, ids: IntArray) -> IntArray:
+    def new_anchors(self, ids: IntArray) -> list[int]:
         """Return the landmarks among ``ids`` (m,) whose ranges have no bias yet, each once."""
-        known = [-1, *self._begins]
-        return np.unique([each for each in ids.tolist() if each not in known]).astype(np.int64)
+        return sorted({*ids.tolist()} - {-1} - self._begins.keys())
 
     def biases(self, ids: IntArray) -> tuple[FloatArray, IntArray]:
         """Return by how much ranges from landmarks (m,) are too long, metres, 0 where none is.
@@ -237,19 +233,19 @@ class Calibration:
         values = self.values if values is None else values
         stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
         estimates = []
-        for place, (name, unit), value, variance, known in zip(
-            self._places.tolist(), self._names, values, variances, stated, strict=True
+        for place, entry, value, variance, known in zip(
+            self._places.tolist(), self._entries, values, variances, stated, strict=True
         ):
             nominal, factor = self._nominal[place], 1.0
-            if name.partition('/')[0] == 'range_scale':  # s is its logarithm
+            if entry.parameter == 'range_scale':  # s is its logarithm
                 value, nominal = math.exp(value), math.exp(nominal)
                 factor = value
             estimates.append(
                 CalibrationEstimate(
-                    name,
+                    entry.name,
                     float(value),
                     float(factor * np.sqrt(variance)),
-                    unit,
+                    entry.unit,
                     nominal=float(nominal),
                     stated=float(factor * known),
                 )
@@ -334,7 +330,7 @@ def stated_of_velocity(settings: Settings) -> FloatArray:
 
 def _of_velocity(settings: Settings, suffix: str) -> FloatArray:
     """Return what the parameters whose names end in ``suffix`` say of [M b] and τ (43,)."""
-    values = np.zeros(SENSORS)
+    values = np.zeros(DELAY + 1)
     for entry in OF_VELOCITY:
         stated = getattr(settings, entry.parameter + suffix)
         values[entry.place] = stated if entry.axis is None else stated[entry.axis]

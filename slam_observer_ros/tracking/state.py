@@ -186,7 +186,7 @@ class State:
     def calibrate_ranges(self, ids: IntArray) -> None:
         """Begin to calibrate ranges from landmarks (m,), where that is new; −1 is none."""
         if self.calibration.range_bias_m:
-            for landmark_id in self.calibration.without_bias(ids).tolist():
+            for landmark_id in self.calibration.new_anchors(ids):
                 self.calibrate(landmark_id)
 
     def relocate(

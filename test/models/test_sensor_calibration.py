@@ -81,7 +81,7 @@ def observation(rng, m=5, **changes):
 def test_derivatives_of_a_corrected_point_are_those_of_differences(settings, is_depth, rng):
     settings = replace(settings, range_is_depth=is_depth, range_bias_stddev=0.2)
     calibration, anchors = calibrated(settings), np.array([-1, 7, -1, 4, 7])
-    for anchor in calibration.without_bias(anchors).tolist():
+    for anchor in calibration.new_anchors(anchors):
         calibration.add(anchor)
     calibration.shift(0.1 * rng.normal(size=calibration.count))
     event = observation(rng, sensor=np.tile([0.3, 0.1, 0.5], (5, 1)))
