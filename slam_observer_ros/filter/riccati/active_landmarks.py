@@ -137,7 +137,7 @@ class ActiveLandmarks(JointCovariance):
         shifts, following = np.zeros((len(self._places), 3)), self._following
         if self._observer.have_moved:
             self._shifts.clear()
-        for number in set((following.slots[others] // self._outside.slots_each).tolist()):
+        for number, _ in self._outside.by_panel(following.slots[others]):
             if number not in self._shifts:
                 (view,) = following.views(following.out_of_view(number))
                 self._shifts[number] = view.rows, view.shifts
@@ -199,7 +199,6 @@ class ActiveLandmarks(JointCovariance):
         """Do all postponed work; let references be present estimates."""
         self._restart(self.active[:0])
         self._following.finish()
-        self._shifts.clear()
 
     def _restart(self, released: IntArray) -> None:
         """Let x start again, without landmarks (m,); change all others little by little."""

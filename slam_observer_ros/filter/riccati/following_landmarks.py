@@ -41,7 +41,7 @@ class FollowingLandmarks:
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
         self.start(np.empty(0))
         self._changed = 0  # panels, since the last correction
-        self._moved_panels: dict[int, MovedPanel] = {}  # those of which somebody has looked
+        self._moved_panels: dict[int, MovedPanel] = {}  # where somebody has looked
 
     def copy(self, observer: FilterArrays) -> FollowingLandmarks:
         """Return an independent copy for a copy of the observer."""
