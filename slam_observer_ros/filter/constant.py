@@ -56,7 +56,7 @@ class ConstantGains(Gains):
     ) -> Observed:
         """Move the state by the innovation (28)–(31) of all that is seen: nothing is rejected."""
         known, out = seen.rows >= 0, room_for(seen, 0, is_judged)
-        out.points[:], out.origins[:], _ = located(seen, self.axes.point == 2)
+        out.points[:], out.origins[:], _ = located(seen, self.axes.is_planar)
         rows, landmarks = seen.rows[known], self.observer.landmarks
         out.r[:], out.weights[:] = 0.0, known
         if len(rows):

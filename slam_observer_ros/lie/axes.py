@@ -17,6 +17,7 @@ class EstimatedAxes:
         self.pose = pose  # of the pose error ε = (Ω, v), …
         self.p: int = pose.stop - pose.start  # … so many
         self.point = point  # leading axes of a point, 2 or 3
+        self.is_planar = point == 2
         self.turn: int = 3 - pose.start  # how many turns of a landmark, 1 or 3, …
         self.turned: IntArray = np.arange(pose.start, 3)  # … and which: about z, or about all
         self._turned = slice(pose.start, 3)

@@ -136,7 +136,7 @@ class HalfFinder:
         # Noise that is larger than stated makes all differences larger.
         margin = APART * max(best.square / max(best.degrees - axes.p, 1), 1.0)
         alike = [fit.pose for fit, *_ in fits if fit.cost < best.cost + margin]
-        if axes.point == 2 and fits_mirrored(views, best, margin):
+        if axes.is_planar and fits_mirrored(views, best, margin):
             self.in_a_line = known.ids[np.unique(views.named)].tolist()
             return None
         if len(alike) > 1:
@@ -196,7 +196,7 @@ def _views(window: Window, state: State, known: LandmarkMap) -> Views | None:
     range_m = np.linalg.norm(lines, axis=1)
     measured = MEASURED[kinds]
     is_direction = np.repeat(measured[:, [1]], 3, axis=1)
-    is_direction[:, 2] = measured[:, 2] & (state.axes.point == 3)
+    is_direction[:, 2] = measured[:, 2] & (not state.axes.is_planar)
     partial = lines * is_direction
     level = np.linalg.norm(partial, axis=1, keepdims=True)
     variances = np.array([view.variances for view in views])

@@ -175,7 +175,7 @@ class MappedLandmarks:
             order = np.argsort(distances)
             self._pairs: IntArray = pairs[order]
             self._distances: FloatArray = distances[order]
-            if self.axes.point == 3:
+            if not self.axes.is_planar:
                 keys = self._key(pairs.T, distances).ravel()
                 by_first = np.argsort(keys)
                 self._keys: FloatArray = keys[by_first]

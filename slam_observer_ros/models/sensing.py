@@ -76,7 +76,7 @@ def calibrated_again(calibration: Calibration, event: ObservationEvent) -> Obser
     if calibration.range_bias_m:
         arms = without_bias(arms, calibration.biases(sensed.anchors)[0]) * arms
     points = arms.dot(scale * R.T) + sensor
-    if calibration.axes.point == 2:  # the line of sight keeps its height
+    if calibration.axes.is_planar:  # the line of sight keeps its height
         sensor[:, 2] -= points[:, 2]
         points[:, 2] = 0.0
     if sensed.orientations is not None:

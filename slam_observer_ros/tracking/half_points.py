@@ -413,7 +413,7 @@ def _completed(
 
 def of_axes(kinds: IntArray | None, state: State) -> IntArray:
     """Return kinds as they are in the plane, too, where an azimuth is a whole direction."""
-    whole = {AZIMUTH: BEARING, AZIMUTH_RANGE: POINT} if state.axes.point == 2 else {}
+    whole = {AZIMUTH: BEARING, AZIMUTH_RANGE: POINT} if state.axes.is_planar else {}
     all_kinds = np.asarray(kinds)
     for azimuth, kind in whole.items():
         all_kinds = np.where(all_kinds == azimuth, kind, all_kinds)
@@ -425,7 +425,7 @@ def expected_lines(state: State, event: ObservationEvent, rows: IntArray) -> Flo
     R, shift, scale = sensor_values(state, event.sensor_frame)
     origins = event.points - event.lines_of_sight + shift
     lines = state.observer.body_points(rows) - origins
-    if state.axes.point == 2:
+    if state.axes.is_planar:
         lines[:, 2] = 0.0
     shown: FloatArray = lines @ R / scale
     if state.calibration.range_bias_m:

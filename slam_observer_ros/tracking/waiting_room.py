@@ -115,7 +115,7 @@ class WaitingView:
     def seen(self, state: State) -> tuple[FloatArray, FloatArray]:
         """Return where the sensor was, and its line of sight as calibrated now: (3,) each."""
         R, shift, scale = sensor_values(state, self.sensor_frame)
-        flat = np.array([1.0, 1.0, float(state.axes.point == 3)])
+        flat = np.array([1.0, 1.0, float(not state.axes.is_planar)])
         shown = without_bias(self.shown[None], self.biases_m(state))[0] * self.shown
         origin, line = (self.mount + shift) * flat, scale * (R @ shown) * flat
         turn = self.pose[:3, :3]
@@ -234,7 +234,7 @@ class WaitingRoom:
         """
         self._way.go_on(state, event.stamp_ns)
         view = self._way.view(state, event, row, covariance, self._observations)
-        if state.axes.point == 3 and view.kind in (AZIMUTH, AZIMUTH_RANGE):
+        if not state.axes.is_planar and view.kind in (AZIMUTH, AZIMUTH_RANGE):
             return None  # no height follows from it, or hardly
         landmark_id = view.landmark_id
         views = self._views.setdefault(landmark_id, deque(maxlen=MOST_VIEWS))
