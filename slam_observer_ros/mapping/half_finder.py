@@ -246,7 +246,7 @@ class _Problem:
     """Residuals of views at b poses T (b, 4, 4) and ln scales s (b, n_s) at once."""
 
     def __init__(self, views: Views, axes: EstimatedAxes, scale_sigma: float) -> None:
-        self._views, self._axes, self._bias_m = views, axes, views.bias_m
+        self._views, self._axes = views, axes
         self._scale_sigma = max(scale_sigma, 1e-6)
         self._is_range = np.isfinite(views.ranges)
         self._ranges = np.where(self._is_range, views.ranges, 0.0)
@@ -310,7 +310,7 @@ class _Problem:
         """Return how uncertain residuals (b, n, 4) are, each by itself: variances."""
         of_ranges, of_directions = self._views.variances.T
         variances = np.empty((*lengths.shape, 4))
-        variances[..., 0] = of_ranges + self._way_m2 + self._bias_m**2
+        variances[..., 0] = of_ranges + self._way_m2 + self._views.bias_m**2
         angular = of_directions + self._way_rad2 + self._way_m2 / lengths**2
         variances[..., 1:] = angular[..., None]
         return variances
@@ -389,7 +389,7 @@ class _Problem:
         view = rows // 4
         later = np.maximum(view[:, None], view[None, :]) == view[None, :]
         same = views.named[view][:, None] == views.named[view][None, :]
-        weights, biases = np.ones(len(rows)), self._bias_m * (rows % 4 == 0)
+        weights, biases = np.ones(len(rows)), views.bias_m * (rows % 4 == 0)
         cost, square, covariance = np.inf, np.inf, np.eye(len(columns))
         for _ in range(FITTING_STEPS):
             e, lines, lengths = self.parts(T, s)
