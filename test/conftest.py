@@ -126,7 +126,7 @@ def ros_domain_id() -> Iterator[int]:
 def log_as_before() -> Iterator[None]:
     """Take back what a module's nodes and libraries have made of the log's levels."""
     loggers = [logging.getLogger(name) for name in (None, 'slam_observer_ros')]
-    before = [(logger.level, logger.handlers) for logger in loggers]
+    before = [(logger.level, [*logger.handlers]) for logger in loggers]
     yield
     for logger, (level, handlers) in zip(loggers, before, strict=True):
         logger.setLevel(level)

@@ -170,8 +170,10 @@ def test_what_helps_throughout_is_clear_though_it_helps_once_far_more(gain, most
     assert score(gains).is_clearly_better(score(0.0 * ones)) == is_clear
 
 
-def test_a_wrong_size_of_tags_is_named_and_its_factor_estimated():
-    (finding,) = mistakes(SETTINGS, list(MADE['tag_size'].apply(drive())))
+@pytest.mark.parametrize('stddev', [0.0, 0.05])
+def test_a_wrong_size_of_tags_is_named_and_its_factor_estimated(stddev):
+    settings = replace(SETTINGS, linear_scale_stddev=(stddev, 0.0, 0.0))
+    (finding,) = mistakes(settings, list(MADE['tag_size'].apply(drive())))
     assert finding.kind == 'tag_size'
     assert float(finding.what.split(' times')[0].split()[-1]) == pytest.approx(1.25, abs=0.05)
 
