@@ -36,6 +36,7 @@ from slam_observer_ros.common.findings import explained
 from slam_observer_ros.common.stamps import to_s
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.lie import so3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.recordings.reader import Recording
 from slam_observer_ros.recordings.trajectory import LandmarkTruth
@@ -54,6 +55,7 @@ MADE = {
     'turning_negated': Correction('', turn=-1.0),
     'driving_negated': Correction('', drive=-1.0),
     'no_turning': Correction('', turn=0.0),
+    'mount_off': Correction('', so3.exp(np.array([0.0, 0.0, math.radians(5.0)]))),
 }
 """What a recording is made wrong by."""
 
@@ -199,7 +201,7 @@ def recordings(world: World) -> dict[str, tuple[Settings, Iterable[Event]]]:
         wrong: Iterable[Event] = world.events
         for kind in kinds:
             wrong = MADE[kind].apply(wrong)
-        made[what] = world.settings, wrong
+        made[what] = with_open_mount(world) if 'mount_off' in kinds else world.settings, wrong
     return made | alarms(world)
 
 
@@ -225,6 +227,7 @@ def alarms(world: World) -> dict[str, tuple[Settings, Iterable[Event]]]:
     settings = world.settings
     return {
         'as it is': (settings, world.events),
+        'as it is, its mount open': (with_open_mount(world), world.events),
         '10 % outliers': (settings, outliers.with_outliers(world, seed=0).events),
         **{
             f'noise × {factor:.2g}': (with_noise(settings, factor), world.events)
@@ -234,6 +237,11 @@ def alarms(world: World) -> dict[str, tuple[Settings, Iterable[Event]]]:
         'carried': (settings, slips.carried(world, seed=0).events),
         'a third of the views': (settings, some(world.events, 3)),
     }
+
+
+def with_open_mount(world: World) -> Settings:
+    """Return settings that leave open how a sensor is turned, which is estimated else."""
+    return replace(world.settings, sensor_rotation_stddev=(0.0, 0.0, 0.0))
 
 
 NOISE = ('angular_velocity_noise', 'linear_velocity_noise')
