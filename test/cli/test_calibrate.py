@@ -114,10 +114,11 @@ def test_a_depth_is_recognised_and_scales_that_trade_are_named(slam_observer, tm
 
 
 @pytest.mark.timeout(300)
-def test_where_all_is_as_stated_nothing_is_written(slam_observer, tmp_path):
+@pytest.mark.parametrize('which', [('--keep-noise',), ('--only', 'noise')])
+def test_where_all_is_as_stated_nothing_is_written(slam_observer, tmp_path, which):
     recording, survey = recorded(tmp_path / 'run.mcap', drive(Settings(**MODEL), 20.0))
     out = tmp_path / 'calibrated.yaml'
-    options = ('--map', survey, *OPTIONS, '--keep-noise', '-o', out)
+    options = ('--map', survey, *OPTIONS, *which, '-o', out)
     ended = slam_observer('calibrate', recording, *options)
     assert ended.code == 4
     assert 'no improvement' in ended.errors
