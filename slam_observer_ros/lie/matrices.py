@@ -9,7 +9,7 @@ from scipy.linalg.lapack import dgesv, dposv, dpotrf, dpotri
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 
-_TINY = np.finfo(np.float64).tiny
+_TINY, _EPSILON = np.finfo(np.float64).tiny, np.finfo(np.float64).eps
 LARGE = 500  # equations whose solution takes longer than NumPy's overhead
 VERY_LARGE = 1500  # equations for which SciPy would keep other threads waiting
 
@@ -166,6 +166,27 @@ def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
     whitened = solve_symmetric(covariances, r[:, :, None])
     squared = np.einsum('ij,ij->i', r, whitened[:, :, 0])
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))  # < 0 where rounding has made them so
+
+
+def squares_and_log_dets(S: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rᵀ S⁻¹ r (…,) of r (…, k), and ln |S| (…,), of small S (…, k, k), at once.
+
+    By elimination: of few matrices LAPACK's overhead is most of what they cost.
+    """
+    k = S.shape[-1]
+    lower = [[S[..., i, j] for j in range(i + 1)] for i in range(k)]
+    left = [r[..., i] for i in range(k)]
+    squares, product = left[0] * left[0] / lower[0][0], lower[0][0]
+    for c in range(1, k):
+        for i in range(c, k):
+            share = lower[i][c - 1] / lower[c - 1][c - 1]
+            left[i] = left[i] - share * left[c - 1]
+            for j in range(c, i + 1):
+                lower[i][j] = lower[i][j] - share * lower[j][c - 1]
+        # Rounding may have made it negative.
+        lower[c][c] = pivot = np.maximum(lower[c][c], _EPSILON * S[..., c, c])
+        squares, product = squares + left[c] * left[c] / pivot, product * pivot
+    return squares, np.log(product)
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:

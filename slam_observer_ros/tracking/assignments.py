@@ -26,11 +26,11 @@ from slam_observer_ros.lie.matrices import (
     cholesky,
     diagonal_blocks,
     mahalanobis,
+    squares_and_log_dets,
     transpose,
     with_blocks,
 )
 from slam_observer_ros.tracking.joint_compatibility import (
-    columns_of,
     JointSearch,
     NewCosts,
     Pairing,
@@ -87,7 +87,7 @@ def find_assignments(
         evidence = 0.5 * (none_costs[at] - huber_loss(mahalanobis(r, noise)))
         return [Assignment(_taken(m, at, rows, -1), _taken(m, at, evidence, 0.0), 0.0)]
     PC, CPC = state.known_errors.predicted(residuals)
-    pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
+    pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise, PC)
     # The cost of a point that is of no landmark.
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
     # Points outside the search; one of no landmark costs the same whatever it might have been.
@@ -105,15 +105,15 @@ def find_assignments(
         pair_costs,
         steps[outside:],
     )
-    moves = _PoseMoves(state, seen, PC)
+    moves = _PoseMoves(state, seen)
     # Nearly always they hardly move the robot, all together.
     whole = search.all_pairs() if are_single and len(at) else None
     is_enough = whole is not None and _largest(moves.by(whole)) <= HARDLY_MOVED
     pairings = [whole] if whole is not None and is_enough else moves.distinct(search.pairings())
     # By how much likelier each pair is than a point of nothing known.
-    S = diagonal_blocks(CPC, axes.point) + noise
-    log_dets = np.linalg.slogdet(S)[1] - np.linalg.slogdet(noise)[1]
-    evidence = np.maximum(0.5 * (none_costs[at] - huber_loss(mahalanobis(r, S)) - log_dets), 0.0)
+    squares, log_dets = squares_and_log_dets(diagonal_blocks(CPC, axes.point) + noise, r)
+    log_dets -= squares_and_log_dets(noise, r)[1]
+    evidence = np.maximum(0.5 * (none_costs[at] - huber_loss(np.sqrt(squares)) - log_dets), 0.0)
     return [
         Assignment(
             _taken(m, at[each.chosen], rows[each.chosen], -1),
@@ -127,16 +127,14 @@ def find_assignments(
 class _PoseMoves:
     """How far pairings move the robot: by the shift of the points, in the sensor's σ."""
 
-    def __init__(self, state: State, seen: _Points, PC: FloatArray) -> None:
+    def __init__(self, state: State, seen: _Points) -> None:
         axes = state.axes
         scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
         self._J = scale @ axes.output_matrix(seen.points)  # points by a pose error
-        self._PC, self._k = PC, axes.point
 
     def by(self, pairing: Pairing) -> FloatArray:
         """Return how far (m, k) the points move by the correction that a pairing makes."""
-        of_pairs = self._PC[:, columns_of(pairing.chosen, self._k)]
-        return np.asarray(self._J @ (of_pairs @ (pairing.L.T @ pairing.z)))
+        return np.asarray(self._J @ pairing.move)
 
     def distinct(self, pairings: list[Pairing]) -> list[Pairing]:
         """Return the first pairing of all that put the robot at one pose."""

@@ -17,9 +17,8 @@ Here q pairs have points and landmarks (q,), residuals (q, k) in metres and cova
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from dataclasses import dataclass, replace
-from itertools import accumulate
+from collections import Counter
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -27,7 +26,13 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.filter.robust import huber_loss
-from slam_observer_ros.lie.matrices import cholesky, diagonal_blocks, mahalanobis, transpose
+from slam_observer_ros.lie.matrices import (
+    cholesky,
+    diagonal_blocks,
+    mahalanobis,
+    squares_and_log_dets,
+    transpose,
+)
 
 MAX_PARTIAL = 16
 """Pairings of the points so far, the cheapest, that are extended by the next point.
@@ -52,6 +57,7 @@ class Pairs:
     residuals: FloatArray
     covariances: FloatArray  # (q k, q k) joint covariance S of the residuals
     noise: FloatArray  # (q, k, k) the part R of it that is the sensor's noise
+    with_pose: FloatArray | None = None  # (p, q k) covariance of the residuals with the pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,31 +77,21 @@ class Pairing:
     """Some of the pairs, none with a point or landmark of another."""
 
     cost: float  # see the module's docstring
-    chosen: list[int]  # the q pairs
-    L: FloatArray  # (q k, q k) inverse Cholesky factor of their S, 1/m
-    z: FloatArray  # (q k,) L r, their residuals in standard deviations
+    chosen: list[int]  # the pairs
+    move: FloatArray  # (p,) by how much they move the pose, if that is asked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Extensions:
-    """Pairings of one size, each with any of the o pairs of one more point, and without any."""
+class _Partial:
+    """Pairings (b,) of some points; ``W`` is of the other points' pairs, the pose, and residuals.
 
-    pairings: list[Pairing]  # b of them
-    options: IntArray  # (o,) the pairs
-    costs: FloatArray  # (b, o + 1) the cost then, last without any; infinite where it can't be
-    rows: FloatArray  # (b, o, k, q k + k) rows to append to L
-    tails: FloatArray  # (b, o, k) entries to append to z
+    With S = L Lᵀ of a pairing W is L⁻¹ [S_others, C P, r]. Where one pairing has a pair more than
+    another, that one has zeros.
+    """
 
-    def extended(self, i: int, j: int) -> Pairing:
-        """Return pairing i with pair j, or without any."""
-        pairing, cost = self.pairings[i], float(self.costs[i, j])
-        if j == len(self.options):
-            return replace(pairing, cost=cost)
-        n = len(pairing.z)
-        L = np.zeros((self.rows.shape[3],) * 2)
-        L[:n, :n], L[n:] = pairing.L, self.rows[i, j]
-        chosen = [*pairing.chosen, int(self.options[j])]
-        return Pairing(cost, chosen, L, np.append(pairing.z, self.tails[i, j]))
+    costs: FloatArray
+    chosen: list[list[int]]
+    W: FloatArray  # (b, c, q k + p + 1)
 
 
 class JointSearch:
@@ -118,101 +114,123 @@ class JointSearch:
         pair_costs: FloatArray | float = 0.0,
         steps: FloatArray | None = None,
     ) -> None:
-        self._pairs = pairs
-        self._certain = certain
-        self._unpaired_costs = unpaired_costs
+        self._certain, self._unpaired_costs = certain, unpaired_costs
         self._margin, self._budget = margin, budget
-        points, counts = np.unique(pairs.points, return_counts=True)
-        # Points with the fewest options first: they are the surest, and the others follow them.
-        order = points[np.argsort(counts, kind='stable')]
-        self._options = [np.flatnonzero(pairs.points == point) for point in order]
+        self._landmarks, self._k = pairs.landmarks.tolist(), pairs.residuals.shape[1]
+        self._uses = Counter(self._landmarks)
+        self._options: dict[int, list[int]] = {}  # the pairs of each point
+        for i, point in enumerate(pairs.points.tolist()):
+            self._options.setdefault(point, []).append(i)
         # What the first point of no landmark costs less for that, the second one, ….
-        self._steps = np.zeros(len(points)) if steps is None else steps
+        self._steps = np.zeros(len(self._options)) if steps is None else steps
         # (q,) what the rise of the cost with a pair is less by
-        self._less = np.linalg.slogdet(pairs.noise)[1] - pair_costs
+        self._less = squares_and_log_dets(pairs.noise, pairs.residuals)[1] - pair_costs
+        S, PC, r = pairs.covariances, pairs.with_pose, pairs.residuals.reshape(-1, 1)
+        self._G = np.concatenate([S, r] if PC is None else [S, PC.T, r], axis=1)
 
     def all_pairs(self) -> Pairing | None:
         """Return the pairing of all pairs; None if one of them is better left out.
 
         No two of them have a point or a landmark in common.
         """
-        pairs = self._pairs
-        q, k = pairs.residuals.shape
-        L = np.asarray(np.linalg.inv(cholesky(pairs.covariances)), dtype=np.float64)
-        z = L @ pairs.residuals.ravel()
-        log_dets = np.log(np.diagonal(L)).reshape(q, k).sum(axis=1)
-        rises = huber_loss(np.linalg.norm(z.reshape(q, k), axis=1)) - 2.0 * log_dets
-        rises -= self._less
+        chosen = list(range(len(self._landmarks)))
+        rises, W = self._of_all(self._G, chosen)
         cost = float(rises.sum())
         if (rises > self._unpaired_costs).any() or cost > self._budget:
             return None
-        return Pairing(cost, list(range(q)), L, z)
+        return Pairing(cost, chosen, W[:, :-1].T @ W[:, -1])
 
     def pairings(self) -> list[Pairing]:
         """Return the pairings, the cheapest first; points without a landmark are in no pair."""
-        partial = [Pairing(0.0, [], np.empty((0, 0)), np.empty(0))]
-        for done, options in enumerate(self._options):  # the pairs of one more point
-            # Pairings of one size are extended together.
-            sizes = dict.fromkeys(len(pairing.chosen) for pairing in partial)
-            groups = [
-                [pairing for pairing in partial if len(pairing.chosen) == size] for size in sizes
-            ]
-            partial = self._cheapest([self._extensions(group, options, done) for group in groups])
-        return partial
-
-    def _cheapest(self, extensions: list[_Extensions]) -> list[Pairing]:
-        """Return the cheapest pairings within margin and budget."""
-        if not extensions:
+        # Points with the fewest options first: they are the surest, and the others follow them.
+        ordered = [self._options[point] for point in sorted(self._options)]
+        ordered.sort(key=len)
+        # Those that are of one landmark, and no other is, in any case all at once.
+        sure = [own[0] for own in ordered if len(own) == 1 and self._is_sure(own[0])]
+        ordered = [own for own in ordered if len(own) > 1 or not self._is_sure(own[0])]
+        columns = columns_of(sure + [i for own in ordered for i in own], self._k)
+        G = self._G[columns]
+        G = np.concatenate([G[:, columns], G[:, len(columns) :]], axis=1)
+        cost, n = 0.0, self._k * len(sure)
+        move = np.zeros(G.shape[1] - len(G) - 1)
+        if sure:
+            rises, W = self._of_all(G, sure)
+            cost, of_pose = float(rises.sum()), slice(len(G) - n, -1)
+            move = W[:, of_pose].T @ W[:, -1]
+            G = G[n:, n:] - W[:, : len(G) - n].T @ W
+        if cost > self._budget:
             return []
-        # No point makes a pairing cheaper, so one that costs too much can be given up at once.
-        costs = np.concatenate([extension.costs.ravel() for extension in extensions])
-        order = np.argsort(costs, kind='stable')[:MAX_PARTIAL]
-        worst = min(self._budget, costs[order[0]] + self._margin)
-        kept = order[np.isfinite(costs[order]) & (costs[order] <= worst)]
-        # Back from positions in all costs to a group, its pairing i and option j.
-        starts = list(accumulate((extension.costs.size for extension in extensions), initial=0))
-        pairings = []
-        for position in kept.tolist():
-            group = bisect_right(starts, position) - 1
-            i, j = divmod(position - starts[group], extensions[group].costs.shape[1])
-            pairings.append(extensions[group].extended(i, j))
-        return pairings
+        partial = _Partial(np.array([cost]), [sure], np.empty((1, 0, G.shape[1])))
+        for done, options in enumerate(ordered, len(sure)):  # the pairs of one more point
+            partial = self._extended(partial, G, options, done)
+            n = self._k * len(options)
+            G = G[n:, n:]
+        moves = move + (partial.W[:, :, -1, None] * partial.W[:, :, :-1]).sum(axis=1)
+        return [
+            Pairing(cost, *each)
+            for cost, *each in zip(partial.costs.tolist(), partial.chosen, moves, strict=True)
+        ]
 
-    def _extensions(self, pairings: list[Pairing], options: IntArray, done: int) -> _Extensions:
-        """Return how pairings (b,) of one size may go on with the pairs ``options`` (o,).
+    def _is_sure(self, pair: int) -> bool:
+        return bool(self._certain[pair]) and self._uses[self._landmarks[pair]] == 1
 
-        They are of the first ``done`` points.
+    def _of_all(self, G: FloatArray, pairs: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Return by how much the cost rises with each of the first pairs (m,) in G, and their W.
+
+        W (m k, …) is of all that follows them in G.
         """
-        S, r, k = self._pairs.covariances, self._pairs.residuals, self._pairs.residuals.shape[1]
-        L = np.array([pairing.L for pairing in pairings])
-        z = np.array([pairing.z for pairing in pairings])
-        # The next rows of the inverse Cholesky factor, and the residuals they predict.
-        columns = np.array([columns_of(pairing.chosen, k) for pairing in pairings])
-        own = k * options[:, None] + np.arange(k)
-        W = L[:, None] @ S[columns[:, None, :, None], own[:, None, :]]  # (b, o, q k, k)
-        left = S[own[:, :, None], own[:, None, :]] - transpose(W) @ W
-        corners = np.linalg.inv(cholesky(left))
-        ahead = r[options] - (z[:, None, None] @ W)[:, :, 0]
-        tails = (corners @ ahead[..., None])[..., 0]
-        # By how much the cost rises with each option, and without any.
-        log_dets = np.log(np.diagonal(corners, axis1=2, axis2=3)).sum(axis=2)
-        rises = huber_loss(np.sqrt((tails * tails).sum(axis=2))) - 2.0 * log_dets
-        rises[self._are_taken(pairings, options)] = np.inf
-        rises -= self._less[options]
-        is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
-        unpaired = done - len(pairings[0].chosen)
-        cost = self._unpaired_costs[options[0]] + self._steps[unpaired]
-        without = np.where(is_certain, np.inf, cost)
-        before = np.array([[pairing.cost] for pairing in pairings])
-        costs = before + np.column_stack([rises, without])
-        rows = np.concatenate([-corners @ transpose(W) @ L[:, None], corners], axis=3)
-        return _Extensions(pairings, options, costs, rows, tails)
+        m, n = len(pairs), self._k * len(pairs)
+        L = cholesky(G[:n, :n])
+        W = np.asarray(np.linalg.solve(L, G[:n, n:]), dtype=np.float64)
+        distances = np.sqrt(np.square(W[:, -1]).reshape(m, -1).sum(axis=1))
+        log_dets = 2.0 * np.log(L.diagonal()).reshape(m, -1).sum(axis=1)
+        return huber_loss(distances) + log_dets - self._less[pairs], W
 
-    def _are_taken(self, pairings: list[Pairing], options: IntArray) -> BoolArray:
-        """Return (b, o) whether another point already has the landmark of a pair."""
-        taken = np.array([self._pairs.landmarks[pairing.chosen] for pairing in pairings])
-        same = self._pairs.landmarks[options][:, None] == taken[:, None]
-        return np.asarray(same.any(axis=2))
+    def _extended(
+        self, partial: _Partial, G: FloatArray, options: list[int], done: int
+    ) -> _Partial:
+        """Return the cheapest within margin and budget of all that pairings may go on with.
+
+        That is any of the pairs ``options`` (o,), which are the first ones in G, or none of them.
+        Pairings are of the first ``done`` points.
+        """
+        W, o, k = partial.W, len(options), self._k
+        b, c = W.shape[:2]
+        # Residuals and their covariances as the pairs so far predict them.
+        n, each = k * o, np.arange(o)
+        own = W[:, :, :n].reshape(b, c, o, k).transpose(0, 2, 3, 1)
+        left = G[:n, :n].reshape(o, k, o, k)[each, :, each] - own @ transpose(own)
+        ahead = G[:n, -1].reshape(o, k) - (own @ W[:, None, :, -1:])[..., 0]
+        # By how much the cost rises with each option, and without any.
+        squares, log_dets = squares_and_log_dets(left, ahead)
+        rises = np.empty((b, o + 1))
+        rises[:, :o] = huber_loss(np.sqrt(squares)) + log_dets - self._less[options]
+        rises[:, o] = self._unpaired_costs[options[0]]
+        rises[:, o] += self._steps[[done - len(pairs) for pairs in partial.chosen]]
+        landmarks = [self._landmarks[option] for option in options]
+        if any(self._uses[landmark] > 1 for landmark in landmarks):
+            for i, pairs in enumerate(partial.chosen):
+                taken = {self._landmarks[pair] for pair in pairs}
+                rises[i, [at for at in range(o) if landmarks[at] in taken]] = np.inf
+        if self._certain[options].all():
+            rises[np.isfinite(rises[:, :o]).any(axis=1), o] = np.inf
+        costs = (partial.costs[:, None] + rises).ravel().tolist()
+        # No point makes a pairing cheaper, so one that costs too much can be given up at once.
+        order = sorted(range(len(costs)), key=costs.__getitem__)[:MAX_PARTIAL]
+        worst = min(self._budget, costs[order[0]] + self._margin) if b else -math.inf
+        kept = [divmod(at, o + 1) for at in order if costs[at] <= worst and costs[at] < math.inf]
+        chosen = [
+            [*partial.chosen[i], options[j]] if j < o else partial.chosen[i] for i, j in kept
+        ]
+        left_costs = np.array([costs[i * (o + 1) + j] for i, j in kept])
+        W = W[[i for i, _ in kept], :, n:]
+        if all(j == o for _, j in kept):
+            return _Partial(left_costs, chosen, W)
+        at = [i for i, _ in kept], [min(j, o - 1) for _, j in kept]
+        rows = G[:n, n:].reshape(o, k, -1)[at[1]] - own[at] @ W
+        more = np.linalg.solve(cholesky(left[at]), rows)
+        more[[j == o for _, j in kept]] = 0.0
+        return _Partial(left_costs, chosen, np.concatenate([W, more], axis=1))
 
 
 def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
