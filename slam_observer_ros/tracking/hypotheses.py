@@ -79,6 +79,22 @@ class _Child:
     parent: int  # number of the hypothesis that it was before
     event: ObservationEvent
     update: Update
+    known: _Known
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """The ids of a state's landmarks, as sets, and which of them surely exist."""
+
+    ids: frozenset[int]
+    sure: frozenset[int]
+    are_own: bool  # whether the sensor gave none of them
+
+    @classmethod
+    def of(cls, state: State) -> _Known:
+        ids, are_sure = state.landmarks.ids, ~state.landmarks.tentative
+        are_own = bool(is_automatic(ids).all())
+        return cls(frozenset(ids.tolist()), frozenset(ids[are_sure].tolist()), are_own)
 
 
 class Hypotheses:
@@ -457,6 +473,7 @@ class Hypotheses:
                 hypothesis.path = hypothesis.path[common:]
         if unknown:
             visibility = self._all[0].visibility
+            visibility.field_of_view.include(likeliest.event.points)
             self._new_landmarks.note(event, visibility.sure_now + visibility.false_now)
         self._note_ambiguity(event)
 
@@ -484,7 +501,7 @@ class Hypotheses:
             yield (one := Association(state, replace(event, ids=taken.event.ids), rows))
             self._weigh(hypothesis, taken, event)
             # Of hypotheses that become one, the first stands for all.
-            child = _Child(hypothesis, number, taken.event, one.update)
+            child = _Child(hypothesis, number, taken.event, one.update, _Known.of(state))
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
             if len(children) == self._limit:
@@ -585,26 +602,25 @@ def _lasting(ambiguity: Ambiguity | None) -> Ambiguity | None:
 
 def _are_one(child: _Child, other: _Child) -> bool:
     state, other_state = child.hypothesis.state, other.hypothesis.state
-    if is_automatic(state.landmarks.ids).all():
-        return have_one_map(state, other_state)
+    if child.known.are_own:
+        return have_one_map(state, other_state, child.known, other.known)
     return are_one(state, child.event, other_state, other.event)  # else ids will show
 
 
-def have_one_map(state: State, other: State) -> bool:
+def have_one_map(
+    state: State, other: State, known: _Known | None = None, others_known: _Known | None = None
+) -> bool:
     """Return whether two hypotheses have the same landmarks at the same places about the robot.
 
     By how well either of them knows where they are, and the sensor would see them: no observation
     to come will show then which of them is right. Where one of them has a landmark that the other
     has not, that is yet to be confirmed.
     """
+    known, others_known = known or _Known.of(state), others_known or _Known.of(other)
+    if not (known.sure <= others_known.ids and others_known.sure <= known.ids):
+        return False
     rows = state.landmarks.rows_of(other.landmarks.ids)
     others = np.flatnonzero(rows >= 0)
-    only_here = np.ones(len(state.landmarks), dtype=np.bool_)
-    only_here[rows[others]] = False
-    if (only_here & ~state.landmarks.tentative).any():
-        return False
-    if (~other.landmarks.tentative[rows < 0]).any():
-        return False
     rows = rows[others]
     return _agree(state, rows, other, others) and _agree(other, others, state, rows)
 

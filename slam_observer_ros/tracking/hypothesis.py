@@ -100,19 +100,18 @@ class Visibility:
         self.missed = 0.0  # confirmed landmarks that should have been seen last, and were not
 
     def copy(self) -> Visibility:
-        """Return an independent copy: no array is ever changed in place."""
-        other = copy(self)
-        other.field_of_view = copy(self.field_of_view)
-        return other
+        """Return an independent copy, of a sensor that sees the same by any hypothesis."""
+        return copy(self)
 
     def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
         """Count which landmarks were in view of an observation, already used, and which were seen.
 
-        Some of its points came without an id. Unless others have one (``some_have_ids``), which
-        show better where the robot is, the pose is counted as unexpected if none of the landmarks
-        in view was seen for so long that it is no chance any more. Landmarks that
-        hardly exist are forgotten; landmarks out of view never: one may be the only tie to an
-        older part of the map. Return −2 ln of the probability that landmarks in view were missed.
+        Some of its points came without an id. The field of view is as it was before. Unless others
+        have one (``some_have_ids``), which show better where the robot is, the pose is counted as
+        unexpected if none of the landmarks in view was seen for so long that it is no chance any
+        more. Landmarks that hardly exist are forgotten; landmarks out of view never: one may be
+        the only tie to an older part of the map. Return −2 ln of the probability that landmarks in
+        view were missed.
         """
         # What should have been seen, and was.
         landmarks = state.landmarks
@@ -127,7 +126,6 @@ class Visibility:
         self.missed = landmarks.likely_share * np.count_nonzero(unseen & ~landmarks.tentative)
         rows = np.flatnonzero(in_view & (is_numbered | (not some_have_ids)))
         landmarks.note_in_view(rows, seen[rows], has_moved)
-        self.field_of_view.include(event.points)
         unlikely = landmarks.unlikely()
         self.false_now = len(unlikely)
         state.forget(unlikely, Change.UNSUPPORTED, event.stamp_ns)
@@ -143,6 +141,8 @@ class Visibility:
 
     def _miss(self, landmarks: LandmarkTable, unseen: IntArray, has_moved: bool) -> float:
         """Let landmarks (u,) in view be missed once more; return what that costs."""
+        if not len(unseen):
+            return 0.0
         hidden, exist = landmarks.hidden(unseen, has_moved), landmarks.existence(unseen)
         landmarks.weigh(unseen, np.log(hidden))
         cost = -2.0 * float(np.sum(np.log1p(exist * (hidden - 1.0))))

@@ -166,6 +166,7 @@ def test_before_it_is_known_where_a_sensor_looks_no_place_is_unexpected():
             look, np.array([UNKNOWN_ID]), np.array([[1.0, 0.0, 0.0]])
         )
         assert visibility.note(state, straight_ahead, some_have_ids=False) == 0.0
+        visibility.field_of_view.include(straight_ahead.points)
     assert state.counts['unexpected_place'] == 0
 
 
@@ -179,6 +180,7 @@ def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_so
     landmarks.note_in_view = lambda rows, seen, has_moved: None  # so that the share stays
     landmarks.passed[:] = 0
     costs = [visibility.note(state, others, some_have_ids=False)]
+    visibility.field_of_view.include(others.points)
     for landmarks.missed[0] in range(misses):
         costs.append(visibility.note(state, others, some_have_ids=False))
     assert costs[0] == 0.0, 'before anything was seen it is not known where the sensor looks'
