@@ -35,6 +35,8 @@ class ObservationNoise:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self.stood_s = 0.0  # for how long the robot has stood now, 0 while it moves
+        # The last observation and what its points may be off by: hypotheses ask one after another.
+        self._last: tuple[ObservationEvent, FloatArray] | None = None
 
     def covariances(
         self, event: ObservationEvent, lines_of_sight: FloatArray | None = None
@@ -45,7 +47,10 @@ class ObservationNoise:
         direction is known exactly. ``lines_of_sight`` (m, 3) lead from the sensor to where points
         of unknown covariance should be; default where they were measured.
         """
-        lines_of_sight = event.lines_of_sight if lines_of_sight is None else lines_of_sight
+        if lines_of_sight is None:
+            if self._last is None or self._last[0] is not event:
+                self._last = event, self.covariances(event, event.lines_of_sight)
+            return self._last[1]
         if event.covariances is None:
             return self.at(lines_of_sight)
         stated = event.covariances

@@ -12,6 +12,7 @@ that landmark as well as the sensor measures it: a new id suggests a new landmar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,6 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import SPATIAL
 from slam_observer_ros.lie.matrices import (
     cholesky,
-    diagonal_blocks,
-    mahalanobis,
     squares_and_log_dets,
     transpose,
     with_blocks,
@@ -74,46 +73,46 @@ def find_assignments(
     # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
     axes, m = state.axes, len(event.ids)
     seen = _Points(state, event)
-    at, rows = _candidates(state, seen)
-    residuals = _as_residuals(state.observer, seen, at, rows)
+    at, rows, squares, log_dets, residuals = _candidates(state, seen)
     r, noise = residuals.on(axes)
     # Which points are of a known landmark in any case: nearly always all, and each of one.
-    certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
+    by_noise, log_noise = squares_and_log_dets(noise, r)
+    certain = (by_noise <= RESOLUTION**2) & ~seen.is_new_id[at]
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
-    none_costs = np.where(event.ids == UNKNOWN_ID, new_costs.each, gate_cost)
+    none_costs = np.where(seen.has_id, gate_cost, new_costs.each)
     # Nearly always each point may be of one landmark.
-    are_single = len(set(at.tolist())) == len(set(rows.tolist())) == len(at)
-    if is_alone and are_single and len(at) == m and certain.all():
-        evidence = 0.5 * (none_costs[at] - huber_loss(mahalanobis(r, noise)))
+    within = set(at.tolist())
+    are_single, are_certain = len(within) == len(set(rows.tolist())) == len(at), certain.all()
+    if is_alone and are_single and len(at) == m and are_certain:
+        evidence = 0.5 * (none_costs[at] - huber_loss(np.sqrt(by_noise)))
         return [Assignment(_taken(m, at, rows, -1), _taken(m, at, evidence, 0.0), 0.0)]
     PC, CPC = state.known_errors.predicted(residuals)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise, PC)
     # The cost of a point that is of no landmark.
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
     # Points outside the search; one of no landmark costs the same whatever it might have been.
-    within = np.unique(at)
     outside, steps = m - len(within), new_costs.steps
-    fixed_cost = float(none_costs.sum() - unpaired_costs[within].sum() + steps[:outside].sum())
-    margin = 0.0 if certain.all() else pruning_cost(event.ids)
-    pair_costs = -2.0 * np.log(state.landmarks.existence(rows))
+    fixed_cost = float(none_costs.sum() - unpaired_costs[list(within)].sum())
+    fixed_cost += float(steps[:outside].sum())
     search = JointSearch(
         pairs,
         certain,
         unpaired_costs[at],
-        margin,
+        0.0 if are_certain else pruning_cost(event.ids),
         budget - fixed_cost,
-        pair_costs,
+        -2.0 * np.log(state.landmarks.existence(rows)),
         steps[outside:],
     )
-    moves = _PoseMoves(state, seen)
     # Nearly always they hardly move the robot, all together.
     whole = search.all_pairs() if are_single and len(at) else None
-    is_enough = whole is not None and _largest(moves.by(whole)) <= HARDLY_MOVED
-    pairings = [whole] if whole is not None and is_enough else moves.distinct(search.pairings())
+    moves = _PoseMoves(state, seen)
+    if whole is not None and (are_certain or _largest(moves.by(whole)) <= HARDLY_MOVED):
+        pairings = [whole]
+    else:
+        pairings = moves.distinct(search.pairings())
     # By how much likelier each pair is than a point of nothing known.
-    squares, log_dets = squares_and_log_dets(diagonal_blocks(CPC, axes.point) + noise, r)
-    log_dets -= squares_and_log_dets(noise, r)[1]
-    evidence = np.maximum(0.5 * (none_costs[at] - huber_loss(np.sqrt(squares)) - log_dets), 0.0)
+    evidence = none_costs[at] - huber_loss(np.sqrt(squares)) - (log_dets - log_noise)
+    evidence = np.maximum(0.5 * evidence, 0.0)
     return [
         Assignment(
             _taken(m, at[each.chosen], rows[each.chosen], -1),
@@ -128,9 +127,13 @@ class _PoseMoves:
     """How far pairings move the robot: by the shift of the points, in the sensor's σ."""
 
     def __init__(self, state: State, seen: _Points) -> None:
-        axes = state.axes
+        self._axes, self._seen = state.axes, seen
+
+    @cached_property
+    def _J(self) -> FloatArray:  # noqa: N802 (points by a pose error)
+        axes, seen = self._axes, self._seen
         scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
-        self._J = scale @ axes.output_matrix(seen.points)  # points by a pose error
+        return np.asarray(scale @ axes.output_matrix(seen.points))
 
     def by(self, pairing: Pairing) -> FloatArray:
         """Return how far (m, k) the points move by the correction that a pairing makes."""
@@ -138,6 +141,8 @@ class _PoseMoves:
 
     def distinct(self, pairings: list[Pairing]) -> list[Pairing]:
         """Return the first pairing of all that put the robot at one pose."""
+        if len(pairings) < 2:
+            return pairings
         distinct: list[Pairing] = []
         moves: list[FloatArray] = []
         for pairing in pairings:
@@ -167,24 +172,31 @@ class _Points:
         self.known_rows = state.landmarks.rows_of(event.ids)
         # (m, 3, c) how they change with the calibration
         self.D = sensitivity(state, event)
-        has_id = event.ids != UNKNOWN_ID
+        self.has_id = has_id = event.ids != UNKNOWN_ID
         self.some_have_ids, self.is_new_id = bool(has_id.any()), has_id & (self.known_rows < 0)
 
 
-def _candidates(state: State, seen: _Points) -> tuple[IntArray, IntArray]:
-    """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate."""
+def _candidates(
+    state: State, seen: _Points
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, Residuals]:
+    """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate.
+
+    And their residuals, how far off each is alone, squared (q,), and ln |S| (q,).
+    """
     at, rows = _pairs_near(state, seen)
     if seen.some_have_ids:
         allowed = _may_be(state, seen, at, rows)
         at, rows = at[allowed], rows[allowed]
-    residuals = _as_residuals(state.observer, seen, at, rows)
-    distances = state.gains.distances(residuals)
-    # Each pair passes the gate alone; a point keeps its nearest landmarks.
-    order = np.lexsort((distances, at))
-    rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
-    passes = accepted(distances[order], state.settings.rejection_threshold)
-    near = order[(rank < MAX_CANDIDATES) & passes]
-    return at[near], rows[near]
+    residuals, joint = _as_residuals(state.observer, seen, at, rows), state.known_errors.joint
+    r, noise = residuals.on(state.axes)
+    _, own = joint.output(joint.output_matrix(residuals, chord=0.5), rows)
+    squares, log_dets = squares_and_log_dets(own + noise, r)
+    near = accepted(np.sqrt(squares), state.settings.rejection_threshold)
+    if np.count_nonzero(near) > MAX_CANDIDATES:  # a point keeps its nearest landmarks
+        order = np.lexsort((squares, at))
+        rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
+        near[order[rank >= MAX_CANDIDATES]] = False
+    return at[near], rows[near], squares[near], log_dets[near], residuals.select(near)
 
 
 def _pairs_near(state: State, seen: _Points) -> tuple[IntArray, IntArray]:

@@ -138,10 +138,11 @@ def _slips_without_ids(
     Not where others explain what is seen so well that nothing is ``found`` within their reach, nor
     where what is found from there passes the gate: that needs no slip.
     """
-    cost = min((new_costs.of(one.rows < 0) for one in found), default=0.0)
-    if cost <= SLIP_COST or not len(state.landmarks):
+    new = min((int(np.count_nonzero(one.rows < 0)) for one in found), default=0)
+    if not new or not len(state.landmarks):
         return []
-    new = min(int(np.sum(one.rows < 0)) for one in found)
+    if min(new_costs.of(one.rows < 0) for one in found) <= SLIP_COST:
+        return []
     slips: dict[bytes, Interpretation] = {}
     for other in astray(state):
         for assignment in find_assignments(other, event, new_costs, np.inf, False)[:1]:
