@@ -361,6 +361,8 @@ def _step_deviations(steps: FloatArray, settings: Settings) -> FloatArray:
         np.full(k, dt_s),
         np.zeros(k),
         np.zeros((k, 2)),
+        np.empty(0),
+        np.empty((0, 6)),
         np.full(2, np.inf),
     )
     return np.sqrt(np.diagonal(MotionNoise(settings).covariances(held), axis1=1, axis2=2))

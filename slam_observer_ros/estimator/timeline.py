@@ -19,7 +19,7 @@ from slam_observer_ros.events import MeasuredVelocity, ObservationEvent, Velocit
 from slam_observer_ros.lie import se3
 from slam_observer_ros.lie.axes import SPATIAL
 from slam_observer_ros.lie.matrices import transpose
-from slam_observer_ros.models.held_velocities import HeldVelocities
+from slam_observer_ros.models.held_velocities import HeldVelocities, LEAD_NS
 from slam_observer_ros.models.motion_noise import beyond_driving
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
@@ -61,8 +61,9 @@ class Timeline:
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode, bias)
         self.stamp_ns: int | None = None  # of the last event used; None before the first
         self.state_ns: int | None = None  # of the hypotheses: velocities since are pending
-        # A delay, and half of the time over which velocities are averaged to estimate it.
-        self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
+        # A delay, half of the time over which velocities are averaged to estimate it, and that in
+        # which a mean leads to a motion.
+        self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S) + LEAD_NS
         self._on_motion = on_motion
         self._pending = 0
         self.was_late = False  # the last event came after its instant had been passed

@@ -12,17 +12,13 @@
 enum { UNUSUAL = -1, AT_REST = 0, DONE = 1, REJECTS = 2 };
 
 static const double TINY = 2.2250738585072014e-308;
-static const double SPEED_WINDOW_S = 1.0;    /* motion_noise.py */
-static const double MEMORY = 300.0;
-static const double MAX_STEP = 0.5;
+static const double LEAD_S = 0.5;            /* held_velocities.py */
+static const double MEMORY = 300.0, MAX_STEP = 0.5, RARE = 2.33; /* motion_noise.py */
 static const double LEAST_LOGARITHM = -4.605170185988091, LARGEST_LOGARITHM = 6.907755278982137;
-static const double RARE = 2.33;
 static const double MAX_SPEED_ERRORS[2] = {50.0, 1000.0};
-static const double RESOLUTION_M = 1e-4;     /* observation_noise.py */
-static const double RELATIVE_RESOLUTION = 1e-6;
-static const double MAX_ERROR_M = 1e3;
+static const double RESOLUTION_M = 1e-4, RELATIVE_RESOLUTION = 1e-6; /* observation_noise.py */
+static const double MAX_ERROR_M = 1e3, MIN_INTERVAL_S = 1e-3;
 static const double MIN_SHARE = 1e-6, MOST_SHARE_M2 = 1e-6;
-static const double MIN_INTERVAL_S = 1e-3;
 static const double LOST = 1e-7;             /* matrices.py */
 static const double LOG_ROOT_2_PI = 0.9189385332046728;
 static const int REWEIGHTINGS = 2;
@@ -246,9 +242,8 @@ enum { MAX_PIECES = 4096 };
 typedef struct {
     double dt_s, before_s[2], V[6], Q[6]; /* Q: variances of what it moves the robot by, … */
     double stated[36];                    /* … and covariances, where they were stated */
-    int is_stated[2];
     double until_s, moved[6];             /* sums up to its end */
-    int moves;
+    int is_stated[2], moves;
 } Piece;
 
 /* How many entries are before a stamp, or also at it: bisection. */
@@ -288,7 +283,7 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
     for (long row = first; row < last; row++) {
         Piece *piece = &pieces[row - first];
         const i64 *since_ns = v->since_ns + 2 * row;
-        i64 begins_ns = row == first ? start_ns : v->stamps_ns[row];
+        i64 begins_ns = v->stamps_ns[row] > start_ns ? v->stamps_ns[row] : start_ns;
         i64 ends_ns = row + 1 < last ? v->stamps_ns[row + 1] : end_ns;
         if (!is_stamp(begins_ns) || !is_stamp(ends_ns) || !is_stamp(since_ns[0])
             || !is_stamp(since_ns[1]) || since_ns[1] + v->timeout_ns < ends_ns)
@@ -296,8 +291,7 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
         piece->dt_s = seconds(ends_ns, begins_ns);
         piece->before_s[0] = seconds(begins_ns, since_ns[0]);
         piece->before_s[1] = seconds(begins_ns, since_ns[1]);
-        piece->is_stated[0] = v->is_stated[2 * row];
-        piece->is_stated[1] = v->is_stated[2 * row + 1];
+        piece->is_stated[0] = v->is_stated[2 * row], piece->is_stated[1] = v->is_stated[2 * row + 1];
         if (piece->is_stated[0] || piece->is_stated[1])
             memcpy(piece->stated, v->covariances + 36 * row, sizeof piece->stated);
         memcpy(piece->V, v->V + 6 * row, sizeof piece->V);
@@ -308,26 +302,30 @@ static int fill_pieces(const Velocities *v, long first, long last, i64 start_ns,
     return 1;
 }
 
-/* Noise in proportion to the mean velocity over a window around the middle of each piece. */
-static void add_scale_noise(Piece *pieces, long k, const double scales[6]) {
-    for (long i = 0; i < k; i++) { /* sums until each, of which the first follows one of nothing */
+/* Noise in proportion to the mean velocity over a window around the middle of each piece, and to
+ * the mean until its end over half of that time at least. */
+static void add_scale_noise(Piece *pieces, long k, long lead, const double scales[6]) {
+    for (long i = -lead; i < k; i++) { /* sums, of which the first follows one of nothing */
         pieces[i].until_s = pieces[i - 1].until_s + pieces[i].dt_s;
         for (int j = 0; j < 6; j++)
             pieces[i].moved[j] = pieces[i - 1].moved[j] + pieces[i].dt_s * pieces[i].V[j];
     }
-    long first = -1, last = -1; /* the window is behind the first, and ends with the last */
+    long first = -1, last = -1, since = -lead - 1; /* behind first and since, to the end of last */
     for (long i = 0; i < k; i++) {
         double middle_s = 0.5 * (pieces[i - 1].until_s + pieces[i].until_s);
-        while (first < i - 1 && pieces[first].until_s < middle_s - 0.5 * SPEED_WINDOW_S)
+        while (first < i - 1 && pieces[first].until_s < middle_s - LEAD_S)
             first++;
-        while (last < k - 1 && pieces[last + 1].until_s <= middle_s + 0.5 * SPEED_WINDOW_S)
+        while (last < k - 1 && (last < i || pieces[last + 1].until_s <= middle_s + LEAD_S))
             last++;
-        const Piece *begin = &pieces[first], *end = &pieces[last > i ? last : i];
-        double length_s = larger(end->until_s - begin->until_s, TINY);
-        for (int j = 0; j < 6; j++) {
-            double mean = (end->moved[j] - begin->moved[j]) / length_s;
-            pieces[i].Q[j] += scales[j] * mean * (scales[j] * mean) * pieces[i].dt_s;
-        }
+        while (since < first && pieces[since].until_s < pieces[last].until_s - LEAD_S)
+            since++;
+        const Piece *end = &pieces[last], *begin = &pieces[first], *before = &pieces[since];
+        double here_s = larger(end->until_s - begin->until_s, TINY);
+        double late_s = larger(end->until_s - before->until_s, TINY);
+        for (int j = 0; j < 6; j++)
+            pieces[i].Q[j] += scales[j] * scales[j] * pieces[i].dt_s
+                              * fabs((end->moved[j] - begin->moved[j]) / here_s
+                                     * ((end->moved[j] - before->moved[j]) / late_s));
     }
 }
 
@@ -347,8 +345,8 @@ static void fill_stated(Piece *piece, const double factors[2]) {
 }
 
 /* White noise: held longer than usual, one error has moved the robot by so much more. */
-static void fill_variances(Piece *pieces, long k, const Velocities *v, const Interval *interval,
-                           const MotionFigures *figures) {
+static void fill_variances(Piece *pieces, long k, long lead, const Velocities *v,
+                           const Interval *interval, const MotionFigures *figures) {
     double ahead_s = interval->delay_ns < 0 ? (double)-interval->delay_ns / 1e9 : 0.0;
     double usual_s[2] = {v->usual_s[0] + ahead_s, v->usual_s[1] + ahead_s};
     int some_last = 0;
@@ -365,7 +363,7 @@ static void fill_variances(Piece *pieces, long k, const Velocities *v, const Int
             pieces[i].Q[j] = figures->densities[j] * white_s;
         }
     if (!is_zero(figures->scales, 6))
-        add_scale_noise(pieces, k, figures->scales);
+        add_scale_noise(pieces, k, lead, figures->scales);
     for (long i = 0; i < k; i++) {
         for (int j = 0; j < 6; j++)
             pieces[i].Q[j] *= figures->factors[j / 3];
@@ -546,8 +544,11 @@ static int advance(const FilterState *x, const Velocities *v, const Interval *in
     long first = rows_up_to(v->stamps_ns, v->count, start_ns, 1) - 1;
     long last = rows_up_to(v->stamps_ns, v->count, end_ns, 0);
     last = last > first ? last : first + 1; /* between the same stamps: a piece without time */
-    long k = last - first;
-    if (first < 0 || end_ns < start_ns || k > MAX_PIECES)
+    long k = last - first, lead = first > 0 && !is_zero(figures->scales, 6);
+    i64 lead_ns = start_ns - (i64)(1e9 * LEAD_S);
+    while (lead > 0 && lead < first && v->stamps_ns[first + 1 - lead] > lead_ns)
+        lead++;
+    if (first < 0 || end_ns < start_ns || k + lead > MAX_PIECES)
         return UNUSUAL;
     double at_start[6], at_end[6], ad_first[36], ad_last[36];
     if (interval->reach_ns) {
@@ -558,16 +559,17 @@ static int advance(const FilterState *x, const Velocities *v, const Interval *in
         if (!mean_about(interval->end_ns, v, interval, x->is_planar, at_end))
             return UNUSUAL;
     }
-    size_t pieces_size = (size_t)(k + 1) * sizeof(Piece);
+    size_t pieces_size = (size_t)(lead + 1 + k) * sizeof(Piece);
     char *memory = PyMem_Malloc(pieces_size + (size_t)(2 * x->p * x->N) * sizeof(double));
     if (memory == NULL)
         return UNUSUAL;
-    Piece *pieces = (Piece *)memory + 1; /* behind one of nothing, at which sums begin */
+    Piece *pieces = (Piece *)memory + 1 + lead; /* behind one of nothing, at which sums begin */
     memset(memory, 0, sizeof(Piece));
     int status = UNUSUAL;
-    if (fill_pieces(v, first, last, start_ns, end_ns, x->is_planar, pieces)) {
+    if (fill_pieces(v, first + 1 - lead, first + 1, lead_ns, start_ns, 0, pieces - lead)
+        && fill_pieces(v, first, last, start_ns, end_ns, x->is_planar, pieces)) {
         int some_move = 0, some_are_empty = 0;
-        fill_variances(pieces, k, v, interval, figures);
+        fill_variances(pieces, k, lead, v, interval, figures);
         memset(out->variances, 0, 6 * sizeof(double));
         for (long i = 0; i < k; i++) {
             some_move |= pieces[i].moves, some_are_empty |= pieces[i].dt_s == 0.0;

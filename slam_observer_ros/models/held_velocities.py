@@ -7,8 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import to_s
+from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+
+LEAD_S = 0.5  # either side of it, a mean shows how fast the robot is in the middle
+LEAD_NS = round(LEAD_S * NANOSECONDS_PER_SECOND)
 
 
 class Velocities(NamedTuple):
@@ -34,6 +37,8 @@ class HeldVelocities:
     dt_s: FloatArray  # (k,) how long each was held
     gap_s: FloatArray  # (k,) with dt_s zero: how long none was known, as it had timed out
     before_s: FloatArray  # (k, 2) how long each had been held for before
+    lead_s: FloatArray  # (b,) how long the velocities were held that lead to these …
+    lead_velocities: FloatArray  # … (b, 6)
     usual_s: FloatArray  # (2,) how long they are held for as a rule; infinite if unknown
 
     @classmethod
@@ -47,6 +52,8 @@ class HeldVelocities:
             dt_s=np.zeros(k),
             gap_s=gap_s,
             before_s=np.zeros((k, 2)),
+            lead_s=np.empty(0),
+            lead_velocities=np.empty((0, 6)),
             usual_s=np.full(2, np.inf),
         )
 
@@ -67,6 +74,7 @@ def held(velocities: Velocities, start_ns: int, end_ns: int) -> HeldVelocities:
         rows, before_s = first + piece, before_s[piece]
         dt_ns = np.where(is_gap, 0, (dt_ns - gap_ns)[piece])
         gap_ns = np.where(is_gap, gap_ns[piece], 0)
+    lead_s, lead_velocities = lead(velocities, first, start_ns)
     return HeldVelocities(
         body_velocities=velocities.body_velocities[rows],
         covariances=velocities.covariances[rows],
@@ -74,23 +82,43 @@ def held(velocities: Velocities, start_ns: int, end_ns: int) -> HeldVelocities:
         dt_s=to_s(dt_ns),
         gap_s=to_s(gap_ns),
         before_s=before_s,
+        lead_s=lead_s,
+        lead_velocities=lead_velocities,
         usual_s=np.array([velocities.usual_angular_s, velocities.usual_linear_s]),
     )
 
 
-def averaged(body_velocities: FloatArray, dt_s: FloatArray, window_s: float) -> FloatArray:
-    """Return the mean velocities (k, 6) over windows around the middle of each of k pieces.
+def lead(velocities: Velocities, row: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
+    """Return what was in force just before a stamp in a row: seconds (b,), velocities (b, 6)."""
+    begin_ns, stamps_ns = end_ns - LEAD_NS, velocities.stamps_ns
+    oldest = max(int(stamps_ns.searchsorted(begin_ns, 'right')) - 1, 1)  # row 0 is unknown
+    bounds_ns = np.append(stamps_ns[oldest : row + 1], end_ns)
+    bounds_ns[0] = max(bounds_ns[0], begin_ns)
+    return to_s(np.diff(bounds_ns)), velocities.body_velocities[oldest : row + 1]
 
-    As far as they are held here; one that was held for longer than the window is its own mean.
+
+def squared_speeds(held: HeldVelocities) -> FloatArray:
+    """Return squares (k, 6) of how fast the robot is in each of k pieces.
+
+    One factor is the mean velocity over a window around the middle of the piece, as far as it is
+    in the motion; the other one is the mean until the window's end over half a second at least,
+    of which the noise in the first one is a small part.
     """
+    dt_s, b = np.append(held.lead_s, held.dt_s), len(held.lead_s)
     times_s = np.append(0.0, np.cumsum(dt_s))
     motions = np.zeros((len(times_s), 6))
-    np.cumsum(dt_s[:, None] * body_velocities, axis=0, out=motions[1:])
-    middles_s = 0.5 * (times_s[:-1] + times_s[1:])
-    numbers = np.arange(len(middles_s))
-    starts = np.minimum(times_s.searchsorted(middles_s - 0.5 * window_s), numbers)
-    ends = times_s.searchsorted(middles_s + 0.5 * window_s, side='right') - 1
+    V = np.concatenate([held.lead_velocities, held.body_velocities])
+    np.cumsum(dt_s[:, None] * V, axis=0, out=motions[1:])
+    middles_s = 0.5 * (times_s[b:-1] + times_s[b + 1 :])
+    numbers = np.arange(b, len(dt_s))
+    starts = times_s.searchsorted(middles_s - LEAD_S)
+    starts = np.minimum(np.maximum(starts, b), numbers)
+    ends = times_s.searchsorted(middles_s + LEAD_S, side='right') - 1
     ends = np.maximum(ends, numbers + 1)
-    lengths_s = np.maximum(times_s[ends] - times_s[starts], np.finfo(np.float64).tiny)
-    means: FloatArray = (motions[ends] - motions[starts]) / lengths_s[:, None]
-    return means
+    since = np.minimum(times_s.searchsorted(times_s[ends] - LEAD_S), starts)
+
+    def mean(begins: IntArray) -> FloatArray:
+        lengths_s = np.maximum(times_s[ends] - times_s[begins], np.finfo(np.float64).tiny)
+        return np.asarray((motions[ends] - motions[begins]) / lengths_s[:, None])
+
+    return np.abs(mean(starts) * mean(since))

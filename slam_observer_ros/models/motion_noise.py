@@ -31,7 +31,7 @@ from slam_observer_ros.common.errors import significant
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.lie.matrices import diagonal_blocks, limited, mahalanobis, solve_definite
-from slam_observer_ros.models.held_velocities import averaged, HeldVelocities
+from slam_observer_ros.models.held_velocities import HeldVelocities, squared_speeds
 from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
 # Standard deviations of a velocity that only say 'unknown': no robot turns or moves as fast.
@@ -40,7 +40,6 @@ MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
 # Standard deviations of a motion in one gap, rad and m: it is as unknown as it can be. More would
 # only drown all else that is known in rounding.
 MAX_GAP_ERRORS = np.repeat([np.pi, 1000.0], 3)
-SPEED_WINDOW_S = 1.0  # a velocity is averaged over it, as its error may be in proportion to it
 MEMORY = 300  # observations over which the factors are found: they follow a change of the ground
 MAX_STEP = 0.5  # change of ln ρ by one observation, at most
 
@@ -61,7 +60,7 @@ class MotionFigures(NamedTuple):
     """How far velocities may be off."""
 
     densities: FloatArray  # (6,) variances of the motion per second, rad² and m²
-    scales: FloatArray  # (6,) the same in proportion to the mean velocity, its square root
+    scales: FloatArray  # (6,) √s: square roots of the same at a speed of 1 rad/s or m/s
     factors: FloatArray  # (2,) of both, for turning and driving
     unknown: FloatArray  # (6,) variances per second of a motion without a velocity, rad² and m²
 
@@ -127,9 +126,9 @@ def motion_noise(
     In rad² and m². The variances are zero in a part, angular or linear, whose covariance is
     stated. None is returned for the covariances where no message states one.
     """
-    V, dt_s, stated = held.body_velocities, held.dt_s[:, None], None
-    # White noise of the stated density, and in proportion to the mean speed: a single message is
-    # noisy itself, and its square too large.
+    dt_s, stated = held.dt_s[:, None], None
+    # White noise of the stated density, and in proportion to the speed: by the mean of the motion
+    # times another mean, as by its square motions that noise makes slower would count for more.
     variances: FloatArray = figures.densities * dt_s
     before_s, usual_s, until_s = held.before_s, held.usual_s, held.before_s + dt_s
     if np.count_nonzero(until_s > usual_s):  # as nearly never
@@ -139,7 +138,7 @@ def motion_noise(
         grown_s -= before_s * np.maximum(before_s / usual_s, 1.0)
         variances = figures.densities * np.repeat(grown_s, 3, axis=1)
     if np.count_nonzero(figures.scales):
-        variances += (figures.scales * averaged(V, held.dt_s, SPEED_WINDOW_S)) ** 2 * dt_s
+        variances += figures.scales**2 * squared_speeds(held) * dt_s
     variances = variances * figures.factors.repeat(3)
     if np.count_nonzero(held.is_stated):
         variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0

@@ -6,7 +6,6 @@ from collections import deque
 from dataclasses import dataclass, fields, replace
 import math
 from statistics import median_low
-from typing import Literal
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.models.held_velocities import held, HeldVelocities, Velocities
+from slam_observer_ros.models.held_velocities import held, HeldVelocities, lead, Velocities
 
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND  # before time began
 
@@ -163,26 +162,27 @@ class VelocityHistory:
             [self._periods.add(stamp_ns) for stamp_ns in velocities.stamps_ns.tolist()]
         )
 
-    def _row(self, stamp_ns: int, side: Literal['left', 'right'] = 'right') -> int:
-        """Return the first row behind a stamp, or with ``'left'`` the first at it or behind."""
-        return int(self._joined.stamps_ns[: self._count].searchsorted(stamp_ns, side))
+    def _row(self, stamp_ns: int) -> int:
+        """Return the row in force at a stamp."""
+        return int(self._joined.stamps_ns[: self._count].searchsorted(stamp_ns, 'right')) - 1
 
     def latest(self, stamp_ns: int) -> FloatArray | None:
         """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
-        row, joined = self._row(stamp_ns) - 1, self._joined
+        row, joined = self._row(stamp_ns), self._joined
         if stamp_ns - joined.since_ns[row, 1] > self._timeout_ns:
             return None
         return self._counting(joined.body_velocities[row])
 
     def in_force(self, stamp_ns: int) -> HeldVelocities | None:
         """Return the velocity in force, for a usual time or in a gap; None before the second."""
-        row, joined = self._row(stamp_ns) - 1, self._joined
+        row, joined = self._row(stamp_ns), self._joined
         period_s = self._periods.usual_s
         if math.isinf(period_s):  # of means over time, which have none
             period_s = to_s(int(joined.stamps_ns[row] - joined.stamps_ns[row - 1]))
         if row < 2 or period_s <= 0.0:
             return None
-        one = slice(row, row + 1)
+        one, flat = slice(row, row + 1), self.flat()
+        lead_s, lead_velocities = lead(flat, row, stamp_ns)
         timed_out = stamp_ns - joined.since_ns[row, 1] > self._timeout_ns
         return HeldVelocities(
             body_velocities=self._counting(joined.body_velocities[one]),
@@ -191,7 +191,9 @@ class VelocityHistory:
             dt_s=np.array([0.0 if timed_out else period_s]),
             gap_s=np.array([period_s if timed_out else 0.0]),
             before_s=np.zeros((1, 2)),
-            usual_s=np.array(self.flat()[5:7]),
+            lead_s=lead_s,
+            lead_velocities=lead_velocities,
+            usual_s=np.array(flat[5:7]),
         )
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:

@@ -128,7 +128,8 @@ def position_error_m(estimator: Estimator, world: World) -> float:
 def _velocity_noise(model: MotionNoise, V: FloatArray, rng: np.random.Generator) -> FloatArray:
     zero, dt_s = np.zeros(len(V)), np.full(len(V), STEP_S)
     unknown = np.zeros((len(V), 6, 6)), np.zeros((len(V), 2), dtype=bool)
-    held = HeldVelocities(V, *unknown, dt_s, zero, np.zeros((len(V), 2)), np.full(2, np.inf))
+    before = np.zeros((len(V), 2)), np.empty(0), np.empty((0, 6))
+    held = HeldVelocities(V, *unknown, dt_s, zero, *before, np.full(2, np.inf))
     variances = np.diagonal(model.covariances(held), axis1=1, axis2=2)
     return np.sqrt(variances) / STEP_S * rng.standard_normal(V.shape)
 

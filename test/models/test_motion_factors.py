@@ -182,7 +182,8 @@ def test_factors_multiply_covariances_of_messages_too_but_not_those_of_gaps():
     stated = np.array([np.eye(6)] * k)
     held = HeldVelocities(
         np.ones((k, 6)), stated, np.ones((k, 2), dtype=bool),
-        np.array([0.1, 0.0]), np.array([0.0, 2.0]), np.zeros((k, 2)), usual_s,
+        np.array([0.1, 0.0]), np.array([0.0, 2.0]), np.zeros((k, 2)),
+        np.empty(0), np.empty((0, 6)), usual_s,
     )  # fmt: skip
     noise = MotionNoise(Settings())
     before = noise.covariances(held)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -42,6 +43,8 @@ def held(velocities, dt_s, gap_s=None, covariances=None):
         np.array(dt_s, dtype=float),
         np.zeros(k) if gap_s is None else np.array(gap_s, dtype=float),
         np.zeros((k, 2)),
+        np.empty(0),
+        np.empty((0, 6)),
         np.full(2, np.inf),
     )
 
@@ -93,6 +96,24 @@ def test_noise_of_the_messages_does_not_pass_for_speed_however_many_there_are(rn
         MotionNoise(settings).covariances(held(velocities, np.full(k, 1.0 / rate_hz))).sum(axis=0)
     )
     np.testing.assert_allclose(np.sqrt(total[3, 3]), 0.1 * 0.5 * np.sqrt(duration_s), rtol=0.15)
+
+
+@pytest.mark.parametrize(('rate_hz', 'messages'), [(10, 1), (20, 1), (20, 2)])
+def test_motions_that_noise_makes_slower_count_for_no_more_than_others(rate_hz, messages):
+    """By the square of the speed they would, and a scale be found too large by a fifth."""
+    noise = {'linear_velocity_noise': (0.0,) * 3, 'linear_scale_noise': (0.1, 0.0, 0.0)}
+    model, history = MotionNoise(Settings(**noise)), VelocityHistory(SECOND)
+    speeds = np.random.default_rng(1).normal(0.5, 0.05 * np.sqrt(rate_hz), 1500 * messages)
+    period_ns = SECOND // rate_hz
+    for step, speed in enumerate(speeds.tolist()):
+        history.append(VelocityEvent(step * period_ns, np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])))
+    stamps_ns = range(10 * period_ns, len(speeds) * period_ns, messages * period_ns)
+    motions = [history.held(start_ns, end_ns) for start_ns, end_ns in pairwise(stamps_ns)]
+    moved_m = np.array([held.dt_s @ held.body_velocities[:, 3] for held in motions])
+    variances = np.array([model.covariances(held)[:, 3, 3].sum() for held in motions])
+    weighted = moved_m / variances
+    scale = np.sum(weighted * 0.5 * messages / rate_hz) / np.sum(weighted * moved_m)
+    assert scale == pytest.approx(1.0, abs=0.05)
 
 
 def test_speed_that_changes_within_a_long_motion_counts_as_it_changes():
