@@ -203,9 +203,9 @@ class ObservationEvent:
         stated = {name: getattr(self, name) for name in _OF_POINTS}
         return {name: array for name, array in stated.items() if array is not None}
 
-    def select(self, mask: BoolArray) -> ObservationEvent:
-        """Return the points that ``mask`` (m,) picks."""
-        if np.count_nonzero(mask) == len(mask):
+    def select(self, mask: BoolArray | IntArray) -> ObservationEvent:
+        """Return the points that ``mask`` (m,), or rows, pick."""
+        if mask.dtype == np.bool_ and mask.all():
             return self
         picked = {name: array[mask] for name, array in self.of_points().items()}
         sensed = None if self.sensed is None else self.sensed.select(mask)

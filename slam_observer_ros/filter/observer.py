@@ -152,9 +152,9 @@ class Residuals:
         k = axes.point
         return self.r[:, :k], self.covariances[:, :k, :k]
 
-    def select(self, mask: BoolArray | slice) -> Residuals:
-        """Return the part of it that ``mask`` (m,), or a slice, picks."""
-        if isinstance(mask, np.ndarray) and np.count_nonzero(mask) == len(mask):
+    def select(self, mask: BoolArray | IntArray | slice) -> Residuals:
+        """Return the part of it that ``mask`` (m,), rows, or a slice, picks."""
+        if isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.all():
             return self
         return replace(
             self,

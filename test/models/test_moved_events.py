@@ -7,6 +7,7 @@ import pytest
 
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
+from slam_observer_ros.filter.observer import Residuals
 from slam_observer_ros.lie import se3
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -18,6 +19,21 @@ MOUNTS = se3.exp(np.random.default_rng(0).normal(size=(200, 6)))
 
 def unknown(size):
     return np.diag(np.full(size, UNKNOWN))
+
+
+@pytest.mark.parametrize('rows', [[2, 1], [2, 1, 1], [0], [2, 1, 0]])
+def test_points_are_picked_by_rows_or_by_a_mask(rows):
+    ids, points, noise = (
+        5 + np.arange(3),
+        np.arange(9.0).reshape(3, 3),
+        np.tile(np.eye(3), (3, 1, 1)),
+    )
+    event = ObservationEvent(0, ids, points)
+    residuals = Residuals(ids, points, points, points, noise, np.zeros(3), np.ones(3))
+    assert event.select(np.array(rows)).ids.tolist() == ids[rows].tolist()
+    assert residuals.select(np.array(rows)).rows.tolist() == ids[rows].tolist()
+    mask = np.isin(np.arange(3), rows)
+    assert event.select(mask).ids.tolist() == residuals.select(mask).rows.tolist() == [*ids[mask]]
 
 
 @pytest.mark.parametrize('known_m2', [None, 1e-4])
