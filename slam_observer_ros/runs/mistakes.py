@@ -351,12 +351,16 @@ def _named(
 ) -> Steps[list[Finding]]:
     if of_mount_only:
         return (yield from _Trial(settings, first_drive(recorded), known).mount())
+    # Else the size of tags, and what not, would be likelier where a sensor is turned.
+    opened = settings
+    if leaves_mount_open(settings):
+        opened = replace(settings, sensor_rotation_stddev=ROTATION)
     longer = first_drive(recorded, LONGER)
-    trial = _Trial(settings, first_drive(longer), known)
-    findings = yield from trial.named(EARLY, len(longer) == len(trial.events))
+    events = first_drive(longer)
+    findings = yield from _Trial(opened, events, known).named(EARLY, len(longer) == len(events))
     if findings is None:
-        findings = yield from _Trial(settings, longer, known).named(LONGER * EARLY, is_all=True)
-    return findings or (yield from trial.mount())
+        findings = yield from _Trial(opened, longer, known).named(LONGER * EARLY, is_all=True)
+    return findings or (yield from _Trial(settings, events, known).mount())
 
 
 def leaves_mount_open(settings: Settings) -> bool:

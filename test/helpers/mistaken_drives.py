@@ -34,7 +34,7 @@ MADE = {
     'turning_negated': Correction('', turn=-1.0),
     'driving_negated': Correction('', drive=-1.0),
     'no_turning': Correction('', turn=0.0),
-    'mount_off': Correction('', so3.exp(np.array([0.0, 0.0, math.radians(5.0)]))),
+    'mount_off': Correction('', so3.exp(np.array([0.0, 0.0, math.radians(-5.0)]))),
 }
 
 
