@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Siz
 from contextlib import contextmanager
 import logging
 import sys
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from slam_observer_ros.common.errors import json_text
 from slam_observer_ros.common.process import leaving_at_once
@@ -42,11 +42,8 @@ def progress_bar(description: str, total: int | None = None) -> Iterator[Callabl
 
     That shows on standard error, where that is a terminal.
     """
-    with leaving_at_once():
-        from rich import progress
-        from rich.console import Console
-
-    console = Console(stderr=True, highlight=False)
+    progress = _progress()
+    console = progress.Console(stderr=True, highlight=False)
     if not console.is_terminal:
         yield lambda _: None
         return
@@ -67,10 +64,21 @@ def progress_bar(description: str, total: int | None = None) -> Iterator[Callabl
 
 def show_progress(items: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
     """Pass items on, with a progress bar; one that has a length is so many of the ``total``."""
-    with progress_bar(description, total) as advance:
-        for item in items:
-            yield item
-            advance(len(item) if isinstance(item, Sized) else 1)
+
+    def passed_on() -> Iterator[_Item]:
+        with progress_bar(description, total) as advance:
+            for item in items:
+                yield item
+                advance(len(item) if isinstance(item, Sized) else 1)
+
+    _progress()  # now: Ctrl-C ends an import at once, and would leave a file that has been begun
+    return passed_on()
+
+
+def _progress() -> Any:
+    with leaving_at_once():
+        from rich import progress
+    return progress
 
 
 def print_json(result: Mapping[str, object]) -> None:

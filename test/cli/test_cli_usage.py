@@ -223,15 +223,17 @@ def test_a_second_ctrl_c_disturbs_no_clearing_away(first):
 
 
 @pytest.mark.parametrize('module', ['rich', 'numpy', 'scipy'])
-def test_interrupted_while_modules_load(tmp_path, module):
+def test_interrupted_while_modules_load_nothing_is_left(tmp_path, module):
     # Python itself makes such errors of an interrupt, in __set_name__.
     (tmp_path / f'{module}.py').write_text(
         'import signal\ntry:\n    signal.raise_signal(signal.SIGINT)\n'
         "except KeyboardInterrupt as error:\n    raise RuntimeError('in a library') from error\n"
     )
     search_path = os.pathsep.join([str(tmp_path), os.environ.get('PYTHONPATH', '')])
+    (tmp_path / 'outputs').mkdir()
+    output = tmp_path / 'outputs' / 'run.mcap'
     ended = subprocess.run(
-        [*COMMAND, 'simulate'],
+        [*COMMAND, 'replay', 'samples/sample.mcap', '--mcap', output],
         cwd=CHECKOUT,
         env=os.environ | {'PYTHONPATH': search_path},
         capture_output=True,
@@ -240,6 +242,7 @@ def test_interrupted_while_modules_load(tmp_path, module):
         check=False,
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, '', '')
+    assert not list(output.parent.iterdir())
 
 
 @pytest.mark.parametrize(
