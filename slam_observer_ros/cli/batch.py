@@ -238,9 +238,8 @@ def run(args: argparse.Namespace) -> None:
         rows = {name.replace('_', ' '): str(count) for name, count in counts.items()}
         print_table(str(args.out), rows | index)
     if failures:
-        raise IncompleteError(
-            f'{len(failures)} runs failed, see {failed_file}; the same command tries them again'
-        )
+        failed = f'{len(failures)} run{"s" * (len(failures) != 1)} failed'
+        raise IncompleteError(f'{failed}, see {failed_file}; the same command tries again')
 
 
 def _worker_count(text: str) -> int:

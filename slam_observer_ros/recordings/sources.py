@@ -247,7 +247,8 @@ def damage_reported(path: Path, mends: bool = True) -> Iterator[None]:
     except (ImportError, RecordingError):  # of a package that is not installed; named already
         raise
     except Exception as error:
-        reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
+        said = (isinstance(error, OSError) and error.strerror) or str(error)
+        reason = said.strip().split('\n')[0].rstrip('.') or type(error).__name__
         if isinstance(error, UnicodeError):  # bytes where text should be
             reason = f'it is damaged, or no {path.suffix} file'
         remedy = f'; mend it by {MENDED_BY[path.suffix]}' if mends else ''

@@ -72,7 +72,7 @@ class RecordingWriter:
             raise RecordingError(f'{self.path}: recordings are written as .mcap files')
         self._refuse_to_overwrite()
         self._directory = ExitStack()
-        with failing(RecordingError, str(self.path)):
+        with failing(RecordingError, f"can't write {self.path}"):
             # Beside its destination, so that the file can be moved there in one step.
             directory = destination(self.path).parent
             unfinished = self._directory.enter_context(unfinished_directory(directory))
@@ -103,7 +103,7 @@ class RecordingWriter:
             except WriterError as error:
                 raise RecordingError(f'{self.path}: {error}') from error
             except OSError as error:
-                raise RecordingError(f'{self.path}: {error.strerror}') from error
+                raise RecordingError(f"can't write {self.path}: {error.strerror}") from error
 
     def abort(self) -> None:
         """Leave nothing behind."""
@@ -132,7 +132,7 @@ class RecordingWriter:
                 typestore=self._typestore,
                 offered_qos_profiles=[_LATCHED] if latched else [],
             )
-        with failing(RecordingError, str(self.path)):
+        with failing(RecordingError, f"can't write {self.path}"):
             self._bag.write(self._connections[key], receive_stamp_ns, memoryview(data))
 
     def knows(self, message_type: str) -> bool:

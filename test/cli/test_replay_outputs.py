@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 import re
+import resource
 
 import numpy as np
 import pytest
@@ -157,6 +159,20 @@ class TestOutputs:
         (tmp_path / 'link').symlink_to(tmp_path / 'map.yaml')
         outputs = ('--tum', tmp_path / 'link', '--map', tmp_path / 'map.yaml')
         assert 'two outputs' in slam_observer.fail('replay', simulated, *outputs)
+
+    @pytest.mark.parametrize('name', ['run.tum', 'run.html', 'run.mcap'])
+    def test_on_a_full_disk_the_older_file_stays(self, slam_observer, simulated, tmp_path, name):
+        option = {'.html': '--report'}.get(Path(name).suffix, f'--{name[4:]}')
+        (tmp_path / name).write_text('older')
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+        try:
+            ended = slam_observer('replay', simulated, '--force', option, tmp_path / name)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        said = f"slam-observer: error: can't write {tmp_path / name}: File too large\n"
+        assert (ended.code, ended.errors) == (2, said)
+        assert [file.read_text() for file in tmp_path.glob('*run*')] == ['older']
 
     @pytest.mark.parametrize('option', ['--tum', '--map', '--report'])
     def test_where_nothing_may_be_written_is_reported_before_the_work(

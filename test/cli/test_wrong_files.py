@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 import shutil
@@ -52,6 +53,18 @@ def test_a_pipe_is_refused_and_not_waited_for(slam_observer, recording, words):
     assert 'it is no regular file' in error
     assert str(pipe) in error
     assert '[Errno' not in error
+
+
+@pytest.mark.parametrize('suffix', ['mcap', 'db3', 'bag'])
+def test_a_file_that_may_not_be_read_is_named_with_the_reason(slam_observer, monkeypatch, suffix):
+    def refuse(path, *_args, **_options):
+        raise PermissionError(errno.EACCES, 'Permission denied', str(path))
+
+    path = Path(f'run.{suffix}')
+    path.write_text('text')
+    monkeypatch.setattr(Path, 'open', refuse)  # root may read anything
+    said = f'slam-observer: error: {path}: can not be read: Permission denied\n'
+    assert slam_observer.fail('replay', path) == said
 
 
 @pytest.mark.parametrize('words', [*READ[:3], *READ[4:]], ids=' '.join)
