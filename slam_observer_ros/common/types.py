@@ -70,12 +70,13 @@ class LandmarkColumns:
 
     def delete(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""
-        left = 0
+        are_kept = np.ones(self._count, dtype=np.bool_)
+        are_kept[rows] = False
+        kept = np.flatnonzero(are_kept)
         for store in self._stores.values():
-            kept = np.delete(store[: self._count], rows, axis=0)
-            left = len(kept)
-            store[:left], store[left : self._count] = kept, 0
-        self._show(left)
+            store[: len(kept)] = store[kept]
+            store[len(kept) : self._count] = 0
+        self._show(len(kept))
 
     def _show(self, count: int) -> None:
         self._count = count

@@ -211,8 +211,8 @@ class LandmarkTable(LandmarkColumns):
         ``has_moved`` says whether it was made from another place than the one before.
         """
         confirmed = ~self.tentative[rows]
-        self._confirmed_in_view += int(np.sum(confirmed))
-        self._confirmed_seen += int(np.sum(confirmed & seen))
+        self._confirmed_in_view += int(np.count_nonzero(confirmed))
+        self._confirmed_seen += int(np.count_nonzero(confirmed & seen))
         self.in_view[rows] += 1
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
         self.passed[rows] = np.where(seen, 0, self.passed[rows] + has_moved)
@@ -253,6 +253,8 @@ class LandmarkTable(LandmarkColumns):
         self.evidence[rows] = after = self.evidence[rows] + evidence
         is_sure = (after + self.prior >= SURE) & (after < np.inf)
         now = rows[is_sure & (self.was_sure[rows] == 0)]
+        if not len(now):  # as nearly always
+            return 0
         self.was_sure[now] = 1
         self._confirmed_in_view += int(np.sum(self.in_view[now]))
         self._confirmed_seen += int(np.sum(self.counts[now]))

@@ -242,6 +242,8 @@ class History:
         in_order = np.sort(rows)
 
         def without(keyframes: Keyframes) -> Keyframes:
+            if keyframes.landmarks.max(initial=-1) < in_order[0]:  # from before it was added
+                return keyframes
             kept = keyframes.only(~np.isin(keyframes.landmarks, rows))
             return replace(
                 kept, landmarks=kept.landmarks - np.searchsorted(in_order, kept.landmarks)

@@ -77,6 +77,8 @@ class Prior:
     def without(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior without the landmarks at ``rows``; those behind move up."""
         known, columns = self._known(axes, rows)
+        if not len(known):
+            return self
         return replace(
             self,
             points=np.delete(self.points, known, axis=0),

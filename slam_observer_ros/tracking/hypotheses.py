@@ -498,7 +498,10 @@ class Hypotheses:
             if len(taken.named_rows):
                 state.landmarks.renumber(taken.named_rows, taken.given_ids)
             rows = state.landmarks.rows_of(taken.event.ids)
-            yield (one := Association(state, replace(event, ids=taken.event.ids), rows))
+            named = taken.event
+            if named.points is not event.points:  # calibrated, which the step does itself
+                named = replace(event, ids=named.ids)
+            yield (one := Association(state, named, rows))
             self._weigh(hypothesis, taken, event)
             # Of hypotheses that become one, the first stands for all.
             child = _Child(hypothesis, number, taken.event, one.update, _Known.of(state))
@@ -545,8 +548,9 @@ class Hypotheses:
             cost, state = hypothesis.cost, hypothesis.state
             budget = worst - cost
             for taken in interpretations(state, event, new_ids, new_costs, budget, is_alone):
-                possible.append((number, replace(taken, cost=cost + taken.cost)))
-                worst = min(worst, cost + taken.cost + margin)
+                taken.cost += cost
+                possible.append((number, taken))
+                worst = min(worst, taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
         return [(number, taken) for number, taken in possible if taken.cost <= worst]
 

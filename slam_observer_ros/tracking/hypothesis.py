@@ -116,9 +116,10 @@ class Visibility:
         # What should have been seen, and was.
         landmarks = state.landmarks
         is_numbered, everything = is_automatic(landmarks.ids), np.arange(len(landmarks))
+        numbers = np.where(is_numbered, landmarks.ids, 0)
         seen = landmarks.last_seen_ns == event.stamp_ns
         in_view = seen | self.field_of_view.contains(state.observer.body_points(everything))
-        if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
+        if not some_have_ids and self._add_evidence(landmarks, numbers, in_view, seen):
             state.counts['unexpected_place'] += 1
         # What it costs to have missed those without an id of their own; and counts of all.
         has_moved, unseen = self._has_moved(state), in_view & ~seen
@@ -134,7 +135,7 @@ class Visibility:
     def _has_moved(self, state: State) -> bool:
         """Return whether the robot is at another place than when it last was at another one."""
         place, last = state.observer.A[:3, 3], self._last_place
-        has_moved = last is not None and bool(np.linalg.norm(place - last) >= MOVED_M)
+        has_moved = last is not None and math.dist(place.tolist(), last.tolist()) >= MOVED_M
         if last is None or has_moved:
             self._last_place = place.copy()
         return has_moved
@@ -151,17 +152,16 @@ class Visibility:
     def _add_evidence(
         self,
         landmarks: LandmarkTable,
-        event: ObservationEvent,
+        numbers: IntArray,
         in_view: BoolArray,
         seen: BoolArray,
     ) -> bool:
         """Count landmarks (n,) in view that were missed; return whether too many, too long."""
-        numbers = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
         old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)
         if (old & seen).any():
             self._evidence = 0.0
-        elif len(event.points) and self.field_of_view.is_known:
-            evidence = landmarks.rate * int(np.sum(old))
+        elif self.field_of_view.is_known:
+            evidence = landmarks.rate * int(np.count_nonzero(old))
             self._evidence += min(evidence, MAX_EVIDENCE)
         is_unexpected = self._evidence > IMPROBABLE
         if is_unexpected or self._evidence == 0.0:

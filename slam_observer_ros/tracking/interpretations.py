@@ -35,7 +35,7 @@ def _none() -> IntArray:
     return np.empty(0, dtype=np.int64)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Interpretation:
     """One of the meanings that an observation may have: a landmark or none for each point."""
 
