@@ -25,6 +25,10 @@ from slam_observer_ros.settings.estimator_settings import Settings
 FIRST_POSE_DEVIATION = 1e-4
 """The first pose is the map's frame: known to this, rad and m."""
 
+LEAST_VARIANCE = 1e-8
+"""Of a motion, rad² and m²: from what is known better, as of a robot that stands, Cholesky's
+factorisation loses so many digits that GTSAM gives up."""
+
 RELINEARISE_THRESHOLD = 0.01
 """Change (rad, m) from which iSAM2 linearises a variable again; a tenth of GTSAM's default."""
 
@@ -221,7 +225,7 @@ class FrameBuilder:
             motion = np.eye(4)
             factors.add(self.kind.prior())
         else:
-            covariance = covariance + 1e-12 * np.eye(6)
+            covariance = covariance + LEAST_VARIANCE * np.eye(6)
             factors.add(self.kind.between(key, motion, covariance))
         landmarks = [gtsam.symbol('l', landmark_id) for landmark_id in event.ids.tolist()]
         own, larger = self._noise.add(event)
