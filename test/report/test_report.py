@@ -210,6 +210,10 @@ SCRIPTS = {
         });
         return distances.every((d) => Math.abs(d - 5.991464547) < 1e-6);
     """,
+    'interrupted': """
+        run.gaps = [[2, 9]];
+        return interrupted([0, 1, 2, 9, 10, 30], [5, 6, 7, 8, 9, 10]);
+    """,
     'paper': """
         dispatchEvent(new Event('beforeprint'));
         const onPaper = document.querySelectorAll('#curves > div.js-plotly-plot').length;
@@ -235,6 +239,11 @@ def test_motion_in_space_has_a_view_that_turns(report, answers):
 
 def test_ellipses_hold_95_percent_in_any_view(answers):
     assert answers['ellipses']
+
+
+def test_what_observations_show_is_no_line_across_the_time_without_any(answers):
+    expected = [[0, 1, 2, None, 9, 10, 30], [5, 6, 7, None, 8, 9, 10]]
+    assert answers['interrupted'] == expected
 
 
 def test_on_paper_each_curve_is_a_figure_of_its_own(answers):
@@ -358,7 +367,12 @@ def test_distances_and_directions_alone_are_drawn(slam_observer, tmp_path, kind)
         np.testing.assert_allclose(ring[:, :2], landmarks[:, :2], atol=1e-3)
         level = np.linalg.norm((landmarks - instants['xyz'][5])[:, :2], axis=1)
         np.testing.assert_allclose(ring[:, 2], level, atol=0.15)  # a step of the robot
-        assert 'distances, directions' in open_page(report).html
+        shown = 'stateAt(5, PLAN).x[4].filter((x) => x !== null)'
+        opened = opened_with(report, f'document.title = {shown}')
+        assert 'distances, directions' in opened.html
+        xs = re.search('<title>([^<]*)', opened.html).group(1).split(',')
+        edges = [*numbers_of(report)['path']['xyz'][0], *landmarks[:, 0]]
+        assert min(edges) <= min(map(float, xs)) < max(map(float, xs)) <= max(edges)
     else:
         np.testing.assert_allclose(instants['rays'][5], landmarks, atol=0.15)
 

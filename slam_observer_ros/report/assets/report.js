@@ -84,9 +84,11 @@ function stateAt(i, view) {
   /** @type {Curve} */ const hy = [];
   if (view === PLAN) {
     run.instants.rings[i].forEach((/** @type {number[]} */ [cx, cy, radius]) => {
-      for (let n = 0; n <= 72; n += 1) {
-        hx.push(cx + radius * Math.cos(n * Math.PI / 36));
-        hy.push(cy + radius * Math.sin(n * Math.PI / 36));
+      for (let n = 0; n <= 360; n += 1) {
+        const x = cx + radius * Math.cos(n * Math.PI / 180), y = cy + radius * Math.sin(n * Math.PI / 180);
+        const isShown = ground[0][0] <= x && x <= ground[0][1] && ground[1][0] <= y && y <= ground[1][1];
+        hx.push(isShown ? x : null);
+        hy.push(isShown ? y : null);
       }
       hx.push(null);
       hy.push(null);
@@ -105,10 +107,15 @@ function stateAt(i, view) {
   };
 }
 
-const extent = (() => {
-  const all = [0, 1].map((k) => run.path.xyz[k].filter((/** @type {number|null} */ v) => v !== null));
-  return Math.max(...all.map((v) => (v.length ? v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.max(a, b)) - v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.min(a, b)) : 1)), 0.1);
-})();
+/** Least and largest of some numbers. @param {Curve} values @returns {number[]} */
+function span(values) {
+  const known = /** @type {number[]} */ (values.filter((v) => v !== null));
+  return known.length ? [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))] : [0, 1];
+}
+
+const extent = Math.max(...[0, 1].map((k) => { const [least, most] = span(run.path.xyz[k]); return most - least; }), 0.1);
+/* Where the robot and the landmarks are: whole circles about far ones would make all else small. */
+const ground = [0, 1].map((k) => span([run.path.xyz, ...run.instants.points.slice(-1)].flatMap((xyz) => xyz[k])));
 
 const hasDoubts = run.instants.in_doubt.some((/** @type {any[]} */ each) => each.length > 0);
 const hasHalves = [...run.instants.rings, ...run.instants.rays].some((/** @type {any[]} */ each) => each.length > 0);
@@ -186,6 +193,20 @@ function chosenView() {
   return sideView(Number(/** @type {HTMLInputElement} */ (element('turn')).value), Number(/** @type {HTMLInputElement} */ (element('tilt')).value));
 }
 
+/** What observations alone show, and no line across the time without any. @param {number[]} t @param {Curve} y @returns {Curve[]} */
+function interrupted(t, y) {
+  /** @type {Curve[]} */ const [xs, ys] = [[], []];
+  t.forEach((now, n) => {
+    if (n && run.gaps.some((/** @type {number[]} */ [begin, end]) => t[n - 1] < end && begin < now && end - begin > 0.5 * (now - t[n - 1]))) {
+      xs.push(null);
+      ys.push(null);
+    }
+    xs.push(now);
+    ys.push(y[n]);
+  });
+  return [xs, ys];
+}
+
 /** @typedef {{title: string, traces: any[], axis?: any, small?: boolean}} Row */
 
 /** One legend entry inside the row it belongs to: the name is written at the curve's row title.
@@ -207,7 +228,8 @@ function rows() {
   if (errors.smoothed_heading_deg) heading.push(curve(errors.smoothed_t, errors.smoothed_heading_deg, 'smoothed', { color: PINK }));
   if (heading.length) all.push({ title: 'heading [°]', traces: heading });
   if (errors.configuration_m) {
-    all.push({ title: 'configuration [m]', small: true, traces: [curve(errors.configuration_t, errors.configuration_m, 'error of the landmarks as the robot sees them, not aligned', { color: GREEN })], axis: { rangemode: 'tozero' } });
+    const [t, off] = interrupted(errors.configuration_t, errors.configuration_m);
+    all.push({ title: 'configuration [m]', small: true, traces: [{ ...curve(t, off, 'error of the landmarks as the robot sees them, not aligned', { color: GREEN }), mode: 'lines+markers', marker: { size: 2.5, color: GREEN } }], axis: { rangemode: 'tozero' } });
   }
   const ids = residuals.id;
   const moved = new Set(residuals.moved);
@@ -231,10 +253,11 @@ function rows() {
   all.push({ title: 'landmark seen', traces: kinds((/** @type {number} */ i) => names.indexOf(ids[i]), !known), axis: { tickvals: names.map((_, i) => i), ticktext: names.map(String), showgrid: names.length <= 40, range: [-0.7, names.length - 0.3], nticks: 20, tickfont: { size: names.length > 12 ? 9 : 11 } } });
   const fit = [];
   if (consistency.nis) {
+    const [t, nis] = interrupted(consistency.nis_t, consistency.nis);
     fit.push(
       { ...curve(consistency.nis_t, consistency.nis_low, 'low', { width: 0 }), showlegend: false, hoverinfo: 'skip' },
       { ...curve(consistency.nis_t, consistency.nis_high, `95 % of NIS if all noise is as stated`, { width: 0 }), fill: 'tonexty', fillcolor: 'rgba(0,158,115,0.25)', hoverinfo: 'skip' },
-      curve(consistency.nis_t, consistency.nis, `NIS per degree of freedom, means of ${consistency.nis_group}`, { color: GREEN, width: 0.8 }),
+      curve(t, nis, `NIS per degree of freedom, means of ${consistency.nis_group}`, { color: GREEN, width: 0.8 }),
     );
     fit[2].mode = 'lines+markers';
     fit[2].marker = { size: 4, color: GREEN };
