@@ -242,7 +242,7 @@ class History:
         in_order = np.sort(rows)
 
         def without(keyframes: Keyframes) -> Keyframes:
-            if keyframes.landmarks.max(initial=-1) < in_order[0]:  # from before it was added
+            if not (keyframes.landmarks >= in_order[:1]).any():  # from before it was added
                 return keyframes
             kept = keyframes.only(~np.isin(keyframes.landmarks, rows))
             return replace(
