@@ -97,7 +97,8 @@ class EventQueue:
         if -self._near_ns <= ahead_ns <= self._usual_ns:
             if too_late:
                 raise _refusal(ahead_ns)
-            self._take_in_time(event, self.newest_ns)
+            self._events.insert(event, self.newest_ns - self._reach_ns)
+            self._note_in_time(event, self.newest_ns)
             return False
         if too_late or self._is_too_early(event):
             # Far away: refused, and counted if it is a sign of a jump.
@@ -146,10 +147,6 @@ class EventQueue:
     def pop_all(self) -> list[Queued]:
         """Return all events that are left, in order."""
         return self._events.pop_all()
-
-    def _take_in_time(self, event: Queued, newest_ns: int) -> None:
-        self._events.insert(event, newest_ns - self._reach_ns)
-        self._note_in_time(event, newest_ns)
 
     def _note_in_time(self, event: Queued, newest_ns: int) -> None:
         stamp_ns, before_ns = event.stamp_ns, newest_ns

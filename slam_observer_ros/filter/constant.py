@@ -143,12 +143,9 @@ def _step_about(
     H = root[:, None] * np.einsum('i,ijk,ijl->kl', k, J, J) * root
     # The flow along each eigenvector for dt, as a turn about the centre.
     rates, U = np.linalg.eigh(H)
-    xi = axes.full_pose(-root * (U @ (_held_time(rates, dt_s) * (U.T @ g))))
+    # (1 − e^{−λ dt})/λ, and its limit dt at λ = 0
+    positive = np.maximum(rates, np.finfo(float).tiny)
+    held_s = np.where(rates > 0.0, -np.expm1(-positive * dt_s) / positive, dt_s)
+    xi = axes.full_pose(-root * (U @ (held_s * (U.T @ g))))
     R = so3.exp(xi[:3])
     return se3.pose(R, centre - R @ centre + xi[3:])
-
-
-def _held_time(rates: FloatArray, dt_s: float) -> FloatArray:
-    """Return (1 − e^{−λ dt})/λ for ``rates`` λ in 1/s, and its limit dt at λ = 0."""
-    positive = np.maximum(rates, np.finfo(float).tiny)
-    return np.where(rates > 0.0, -np.expm1(-positive * dt_s) / positive, dt_s)

@@ -112,7 +112,10 @@ class Calibration:
         self.velocity_places: IntArray = np.array([e.place for e in self._entries], dtype=np.int64)
         rates = self.velocity_places[self.velocity_places < DELAY]
         self._rows, self._columns = rates // 7, rates % 7
-        stated, deviations = _of_a_sensor(settings)
+        turned, shifted = settings.sensor_rotation_stddev, settings.sensor_translation_stddev
+        scaled = settings.range_scale_stddev / settings.range_scale
+        deviations = np.array([*turned, *shifted, scaled])
+        stated = np.append(np.zeros(6), math.log(settings.range_scale))
         of_sensor = np.append(np.arange(6)[axes.pose], SCALE)
         self.of_sensor: IntArray = of_sensor[deviations[of_sensor] > 0.0]
         self._stated, self._sensor_variances = stated, deviations[self.of_sensor] ** 2
@@ -335,16 +338,6 @@ def _of_velocity(settings: Settings, suffix: str) -> FloatArray:
         stated = getattr(settings, entry.parameter + suffix)
         values[entry.place] = stated if entry.axis is None else stated[entry.axis]
     return values
-
-
-def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
-    """Return ψ, d and s (7,) of a sensor as stated, and their standard deviations (7,)."""
-    deviations = [
-        *settings.sensor_rotation_stddev,
-        *settings.sensor_translation_stddev,
-        settings.range_scale_stddev / settings.range_scale,
-    ]
-    return np.append(np.zeros(6), math.log(settings.range_scale)), np.array(deviations)
 
 
 def without_calibration(settings: Settings) -> Settings:

@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.stamps import is_of_1970, to_ns, to_s
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.events import AngularVelocityEvent, VelocityEvent
 from slam_observer_ros.messages.clouds import CLOUDS, ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import APRILTAGS, no_tags, observed_tags, POSE_ARRAY
@@ -138,7 +138,11 @@ class Contents:
         """
         first = islice(self._decoded((topic,), decode), MAX_COMPARED)
         measured = [
-            (each.stamp_ns, _speeds(each), each.sensor_frame)
+            (
+                each.stamp_ns,
+                each.body_velocity if isinstance(each, VelocityEvent) else each.angular_velocity,
+                each.sensor_frame,
+            )
             for events in first
             for each in events
             if isinstance(each, VelocityEvent | AngularVelocityEvent)
@@ -196,12 +200,6 @@ class Contents:
         for raw in self._source.messages(topics):
             with suppress(MessageError):
                 yield decode(raw)
-
-
-def _speeds(measured: VelocityEvent | AngularVelocityEvent) -> FloatArray:
-    if isinstance(measured, VelocityEvent):
-        return measured.body_velocity
-    return measured.angular_velocity
 
 
 MOST_SAMPLES = 8192

@@ -55,13 +55,10 @@ class OrientationGains(Errors, Gains):
     def learn_motion_noise(self, residuals: Residuals) -> None:
         """Let residuals show how noisy the motion was, before something else corrects it."""
         if len(residuals.rows):
-            S = self.innovation_covariance(residuals)
-            self._learn_motion_noise(residuals, residuals.on(self.axes)[0], S)
-
-    def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:
-        # C as the prediction has it: in the middle between where landmarks are expected and seen.
-        C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
-        self.motion_noise.factors.learn(r, S, C)
+            r, S = residuals.on(self.axes)[0], self.innovation_covariance(residuals)
+            # C as the prediction has it: in the middle of where landmarks are expected and seen.
+            C = self.joint.chart.moved(residuals.e - 0.5 * residuals.r + residuals.a)
+            self.motion_noise.factors.learn(r, S, C)
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Correct the state by known orientations that were seen.
