@@ -239,10 +239,12 @@ class History:
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows`` and all observations of them."""
+        if not len(rows):
+            return
         in_order = np.sort(rows)
 
         def without(keyframes: Keyframes) -> Keyframes:
-            if not (keyframes.landmarks >= in_order[:1]).any():  # from before it was added
+            if not np.any(keyframes.landmarks >= in_order[0]):  # from before it was added
                 return keyframes
             kept = keyframes.only(~np.isin(keyframes.landmarks, rows))
             return replace(
