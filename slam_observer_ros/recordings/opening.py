@@ -255,7 +255,7 @@ def _only_file(directory: Path, why: str = 'without metadata.yaml') -> Path:
         raise RecordingError(
             f"{directory}: {len(files)} files {why}; run 'ros2 bag reindex' on it"
         )
-    raise RecordingError(f'{directory}: no rosbag2 directory ({why}, no .mcap or .db3)')
+    raise RecordingError(f'{directory}: no rosbag2 directory: there is no .mcap or .db3 in it')
 
 
 def _storage_files(path: Path) -> list[Path]:
