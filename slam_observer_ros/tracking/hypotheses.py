@@ -61,6 +61,9 @@ AMBIGUOUS_NS = 5_000_000_000
 DOUBTED = 0.05
 """Probability from which on another map of a landmark is named beside that which is shown."""
 
+DOUBTED_COST = 2.0 * math.log(1.0 / DOUBTED - 1.0)
+"""How much more than the likeliest a map of that probability costs."""
+
 LEAST_DEVIATION = 0.01
 """Deviation of a pose, rad and m, within which poses are the same."""
 
@@ -607,30 +610,46 @@ def _lasting(ambiguity: Ambiguity | None) -> Ambiguity | None:
 def _are_one(child: _Child, other: _Child) -> bool:
     state, other_state = child.hypothesis.state, other.hypothesis.state
     if child.known.are_own:
-        return have_one_map(state, other_state, child.known, other.known)
+        is_unlikely = child.hypothesis.cost >= other.hypothesis.cost + DOUBTED_COST
+        return have_one_map(state, other_state, child.known, other.known, is_unlikely)
     return are_one(state, child.event, other_state, other.event)  # else ids will show
 
 
 def have_one_map(
-    state: State, other: State, known: _Known | None = None, others_known: _Known | None = None
+    state: State,
+    other: State,
+    known: _Known | None = None,
+    others_known: _Known | None = None,
+    is_unlikely: bool = False,
 ) -> bool:
     """Return whether two hypotheses have the same landmarks at the same places about the robot.
 
     By how well either of them knows where they are, and the sensor would see them: no observation
     to come will show then which of them is right. Where one of them has a landmark that the other
-    has not, that is yet to be confirmed.
+    has not, that is yet to be confirmed. Or the first ``is_unlikely``, and the other one has
+    another landmark there: of one that is doubled, :meth:`Hypotheses.fork` asks time and again.
     """
     known, others_known = known or _Known.of(state), others_known or _Known.of(other)
-    if not (known.sure <= others_known.ids and others_known.sure <= known.ids):
+    more, others_more = known.sure - others_known.ids, others_known.sure - known.ids
+    if (more or others_more) and not (is_unlikely and known.ids and others_known.ids):
         return False
+    return _agree(state, more, other) and _agree(other, others_more, state)
+
+
+def _agree(state: State, more: Set[int], other: State) -> bool:
+    """Return whether a state expects landmarks of both where another one has them.
+
+    And each of ``more`` where that one has any.
+    """
     rows = state.landmarks.rows_of(other.landmarks.ids)
     others = np.flatnonzero(rows >= 0)
     rows = rows[others]
-    return _agree(state, rows, other, others) and _agree(other, others, state, rows)
-
-
-def _agree(state: State, rows: IntArray, other: State, others: IntArray) -> bool:
-    """Return whether a state expects landmarks (m,) where another one has them."""
+    if more:
+        added = state.landmarks.rows_of(np.array([*more], dtype=np.int64))
+        points = other.observer.body_points(np.arange(len(other.landmarks)))
+        off = state.observer.body_points(added)[:, None] - points
+        nearest = np.einsum('ijk,ijk->ij', off, off).argmin(axis=1)
+        rows, others = np.append(rows, added), np.append(others, nearest)
     return bool((_distances(state, rows, other, others) <= RESOLUTION).all())
 
 
@@ -646,8 +665,7 @@ def _different(state: State, other: State) -> IntArray:
 def _distances(state: State, rows: IntArray, other: State, others: IntArray) -> FloatArray:
     """Return how far from landmarks (m,) of a state another one has them, in σ of a view."""
     points = other.observer.body_points(others)
-    seen = ObservationEvent(0, state.landmarks.ids[rows], points)
-    noise, m = state.observation_noise.covariances(seen), len(rows)
+    noise, m = state.observation_noise.at(points), len(rows)
     residuals = state.gains.residuals(rows, points, noise, np.zeros(m), np.ones(m))
     return state.gains.distances(residuals)
 

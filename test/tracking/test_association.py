@@ -327,6 +327,14 @@ def test_hypotheses_are_one_where_no_view_to_come_can_show_which_is_right():
     state.landmarks.evidence[2] = np.inf
     assert not have_one_map(state, more), 'a landmark that is sure is in one of them'
     assert not have_one_map(more, state)
+    for shift_m, are_one_map in ((deviation_m, True), (0.5, False)):
+        doubled = state.copy()
+        noise = state.observation_noise.at(points[:1])
+        doubled.gains.add(points[:1] + [shift_m, 0.0, 0.0], noise)
+        doubled.landmarks.add(FIRST_AUTOMATIC_ID + np.array([50]), 0)
+        doubled.landmarks.evidence[-1] = np.inf
+        assert not have_one_map(doubled, state), 'that there are two is yet to be decided'
+        assert have_one_map(doubled, state, is_unlikely=True) == are_one_map
 
 
 def test_the_covariance_of_a_map_is_that_of_all_hypotheses():
