@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import takewhile
 import math
 
@@ -82,22 +83,37 @@ class _Child:
     parent: int  # number of the hypothesis that it was before
     event: ObservationEvent
     update: Update
-    known: _Known
+    known: KnownMap
 
 
-@dataclass(frozen=True, slots=True)
-class _Known:
-    """The ids of a state's landmarks, as sets, and which of them surely exist."""
+class KnownMap:
+    """The landmarks of a state, as they are compared with another one's."""
 
-    ids: frozenset[int]
-    sure: frozenset[int]
-    are_own: bool  # whether the sensor gave none of them
+    def __init__(self, state: State) -> None:
+        ids = state.landmarks.ids
+        self.state, self.ids = state, frozenset(ids.tolist())
+        self.sure = frozenset(ids[~state.landmarks.tentative].tolist())  # these surely exist
+        self.are_own = bool(is_automatic(ids).all())  # the sensor gave no id to any of them
 
-    @classmethod
-    def of(cls, state: State) -> _Known:
-        ids, are_sure = state.landmarks.ids, ~state.landmarks.tentative
-        are_own = bool(is_automatic(ids).all())
-        return cls(frozenset(ids.tolist()), frozenset(ids[are_sure].tolist()), are_own)
+    @cached_property
+    def points(self) -> FloatArray:
+        """(n, 3) where they should be seen, metres, body frame."""
+        return self.state.observer.body_points(np.arange(len(self.state.landmarks)))
+
+    @cached_property
+    def _whitening(self) -> FloatArray:
+        """W (n, k, k): what is off in the body frame is W times as many σ of a view."""
+        state, n, k = self.state, len(self.points), self.state.axes.point
+        noise, joint = state.observation_noise.at(self.points), state.known_errors.joint
+        rows = np.arange(n)
+        residuals = state.gains.residuals(rows, self.points, noise, np.zeros(n), np.ones(n))
+        S = joint.output(joint.output_matrix(residuals), rows)[1] + residuals.on(state.axes)[1]
+        return np.asarray(np.linalg.inv(cholesky(S)) @ state.observer.A[:k, :k])
+
+    def distances(self, rows: IntArray, other: KnownMap, others: IntArray) -> FloatArray:
+        """Return how far from landmarks (m,) another state has its ``others``, in σ of a view."""
+        off = (other.points[others] - self.points[rows])[:, : self.state.axes.point, None]
+        return np.asarray(np.linalg.norm((self._whitening[rows] @ off)[..., 0], axis=1))
 
 
 class Hypotheses:
@@ -392,10 +408,10 @@ class Hypotheses:
 
     def _doubted(self) -> IntArray:
         """Return landmarks that likely hypotheses have elsewhere than the best, or have not."""
-        best = self.best
+        best, known = self.best, KnownMap(self.best)
         probabilities = np.zeros(len(best.landmarks))
         for hypothesis, weight in zip(self._all[1:], self.weights[1:].tolist(), strict=True):
-            probabilities[_different(best, hypothesis.state)] += weight
+            probabilities[_different(known, KnownMap(hypothesis.state))] += weight
         return best.landmarks.ids[probabilities > DOUBTED]
 
     def _note_overthrow(self, shown: Hypothesis, path: Sequence[Branch], stamp_ns: int) -> None:
@@ -406,7 +422,8 @@ class Hypotheses:
         if since is None or _off(best.state, shown.state) <= OVERTHROWN:
             return
         probability = 1.0 / (1.0 + math.exp(0.5 * min(max(shown.cost, 0.0), PRUNING_COST_OF_IDS)))
-        ids = best.state.landmarks.ids[_different(best.state, shown.state)]
+        different = _different(KnownMap(best.state), KnownMap(shown.state))
+        ids = best.state.landmarks.ids[different]
         wrong = Ambiguity(since.stamp_ns, stamp_ns, since.position, probability, ids)
         if self._longest is None or wrong.lasts_ns > self._longest.lasts_ns:
             self._longest = wrong
@@ -507,7 +524,7 @@ class Hypotheses:
             yield (one := Association(state, named, rows))
             self._weigh(hypothesis, taken, event)
             # Of hypotheses that become one, the first stands for all.
-            child = _Child(hypothesis, number, taken.event, one.update, _Known.of(state))
+            child = _Child(hypothesis, number, taken.event, one.update, KnownMap(state))
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
             if len(children) == self._limit:
@@ -611,17 +628,11 @@ def _are_one(child: _Child, other: _Child) -> bool:
     state, other_state = child.hypothesis.state, other.hypothesis.state
     if child.known.are_own:
         is_unlikely = child.hypothesis.cost >= other.hypothesis.cost + DOUBTED_COST
-        return have_one_map(state, other_state, child.known, other.known, is_unlikely)
+        return have_one_map(child.known, other.known, is_unlikely)
     return are_one(state, child.event, other_state, other.event)  # else ids will show
 
 
-def have_one_map(
-    state: State,
-    other: State,
-    known: _Known | None = None,
-    others_known: _Known | None = None,
-    is_unlikely: bool = False,
-) -> bool:
+def have_one_map(known: KnownMap, others_known: KnownMap, is_unlikely: bool = False) -> bool:
     """Return whether two hypotheses have the same landmarks at the same places about the robot.
 
     By how well either of them knows where they are, and the sensor would see them: no observation
@@ -629,45 +640,36 @@ def have_one_map(
     has not, that is yet to be confirmed. Or the first ``is_unlikely``, and the other one has
     another landmark there: of one that is doubled, :meth:`Hypotheses.fork` asks time and again.
     """
-    known, others_known = known or _Known.of(state), others_known or _Known.of(other)
     more, others_more = known.sure - others_known.ids, others_known.sure - known.ids
     if (more or others_more) and not (is_unlikely and known.ids and others_known.ids):
         return False
-    return _agree(state, more, other) and _agree(other, others_more, state)
+    return _agree(known, more, others_known) and _agree(others_known, others_more, known)
 
 
-def _agree(state: State, more: Set[int], other: State) -> bool:
+def _agree(known: KnownMap, more: Set[int], others_known: KnownMap) -> bool:
     """Return whether a state expects landmarks of both where another one has them.
 
     And each of ``more`` where that one has any.
     """
-    rows = state.landmarks.rows_of(other.landmarks.ids)
+    landmarks = known.state.landmarks
+    rows = landmarks.rows_of(others_known.state.landmarks.ids)
     others = np.flatnonzero(rows >= 0)
     rows = rows[others]
     if more:
-        added = state.landmarks.rows_of(np.array([*more], dtype=np.int64))
-        points = other.observer.body_points(np.arange(len(other.landmarks)))
-        off = state.observer.body_points(added)[:, None] - points
+        added = landmarks.rows_of(np.array([*more], dtype=np.int64))
+        off = known.points[added][:, None] - others_known.points
         nearest = np.einsum('ijk,ijk->ij', off, off).argmin(axis=1)
         rows, others = np.append(rows, added), np.append(others, nearest)
-    return bool((_distances(state, rows, other, others) <= RESOLUTION).all())
+    return bool((known.distances(rows, others_known, others) <= RESOLUTION).all())
 
 
-def _different(state: State, other: State) -> IntArray:
+def _different(known: KnownMap, others_known: KnownMap) -> IntArray:
     """Return rows of confirmed landmarks that another state has elsewhere, or has not."""
-    rows = state.confirmed
-    others = other.landmarks.rows_of(state.landmarks.ids[rows])
-    off, known = others < 0, others >= 0
-    off[known] = _distances(state, rows[known], other, others[known]) > RESOLUTION
+    rows = known.state.confirmed
+    others = others_known.state.landmarks.rows_of(known.state.landmarks.ids[rows])
+    off, is_known = others < 0, others >= 0
+    off[is_known] = known.distances(rows[is_known], others_known, others[is_known]) > RESOLUTION
     return rows[off]
-
-
-def _distances(state: State, rows: IntArray, other: State, others: IntArray) -> FloatArray:
-    """Return how far from landmarks (m,) of a state another one has them, in σ of a view."""
-    points = other.observer.body_points(others)
-    noise, m = state.observation_noise.at(points), len(rows)
-    residuals = state.gains.residuals(rows, points, noise, np.zeros(m), np.ones(m))
-    return state.gains.distances(residuals)
 
 
 def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:

@@ -34,6 +34,7 @@ from slam_observer_ros.tracking.hypotheses import (
     are_one,
     have_one_map,
     Hypotheses,
+    KnownMap,
 )
 from slam_observer_ros.tracking.joint_compatibility import (
     huber_loss,
@@ -317,24 +318,28 @@ def test_hypotheses_are_one_where_no_view_to_come_can_show_which_is_right():
     )
     other, more, elsewhere = (state.copy() for _ in range(3))
     other.observer.relocate_landmarks(np.array([0]), points[:1] + [deviation_m, 0.0, 0.0])
-    assert have_one_map(state, other) and have_one_map(other, state)
+
+    def are_one_map(one, another, is_unlikely=False):
+        return have_one_map(KnownMap(one), KnownMap(another), is_unlikely)
+
+    assert are_one_map(state, other) and are_one_map(other, state)
     other.observer.relocate_landmarks(np.array([0]), points[:1] + [0.5, 0.0, 0.0])
-    assert not have_one_map(state, other), 'a landmark is elsewhere'
+    assert not are_one_map(state, other), 'a landmark is elsewhere'
     elsewhere.observer.A[...] = elsewhere.observer.A @ se3.exp(np.array([0, 0, 0, 0.5, 0, 0]))
-    assert not have_one_map(state, elsewhere), 'the robot is elsewhere'
+    assert not are_one_map(state, elsewhere), 'the robot is elsewhere'
     more.remove(np.array([2]))
-    assert have_one_map(state, more) and have_one_map(more, state)
+    assert are_one_map(state, more) and are_one_map(more, state)
     state.landmarks.evidence[2] = np.inf
-    assert not have_one_map(state, more), 'a landmark that is sure is in one of them'
-    assert not have_one_map(more, state)
-    for shift_m, are_one_map in ((deviation_m, True), (0.5, False)):
+    assert not are_one_map(state, more), 'a landmark that is sure is in one of them'
+    assert not are_one_map(more, state)
+    for shift_m, is_doubled in ((deviation_m, True), (0.5, False)):
         doubled = state.copy()
         noise = state.observation_noise.at(points[:1])
         doubled.gains.add(points[:1] + [shift_m, 0.0, 0.0], noise)
         doubled.landmarks.add(FIRST_AUTOMATIC_ID + np.array([50]), 0)
         doubled.landmarks.evidence[-1] = np.inf
-        assert not have_one_map(doubled, state), 'that there are two is yet to be decided'
-        assert have_one_map(doubled, state, is_unlikely=True) == are_one_map
+        assert not are_one_map(doubled, state), 'that there are two is yet to be decided'
+        assert are_one_map(doubled, state, is_unlikely=True) == is_doubled
 
 
 def test_the_covariance_of_a_map_is_that_of_all_hypotheses():
