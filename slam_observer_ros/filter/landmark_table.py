@@ -104,6 +104,7 @@ class LandmarkTable(LandmarkColumns):
             (np.int64, ()),
         ),
         'evidence': (np.float64, ()),
+        'seen_cost': (np.float64, ()),
         'rejected_at': (np.float64, (3,)),
         'rejected_last': (np.float64, (3,)),
     }
@@ -116,6 +117,8 @@ class LandmarkTable(LandmarkColumns):
     # (n,) log of how much likelier each makes what was seen of it than if it were a false point;
     # infinite where an id or a map says that it exists
     evidence: FloatArray
+    # (n,) −2 ln of the likelihood of where each was seen, by what the filter knew then
+    seen_cost: FloatArray
     # (n,) observations without ids that had it in view, how many since it was seen, and from how
     # many other places than before: from a robot that stands it may be hidden in all of them
     in_view: IntArray
@@ -298,11 +301,12 @@ class LandmarkTable(LandmarkColumns):
         self.counts[rows] = 1
         self.rejections[rows] = 0
         self.evidence[rows] = np.where(is_automatic(self.ids[rows]), 0.0, np.inf)
+        self.seen_cost[rows] = 0.0
         self.in_view[rows] = self.passed[rows] = self.missed[rows] = self.was_sure[rows] = 0
 
     def merge(self, rows: IntArray, copies: IntArray) -> None:
         """Count what was seen of ``copies`` (m,), which are about to go, for ``rows`` (m,)."""
-        for counted in (self.counts, self.in_view):
+        for counted in (self.counts, self.in_view, self.seen_cost):
             counted[rows] += counted[copies]
         is_later = self.last_seen_ns[copies] > self.last_seen_ns[rows]
         later, latest = rows[is_later], copies[is_later]

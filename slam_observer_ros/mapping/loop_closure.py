@@ -147,7 +147,12 @@ class LoopClosure:
         # Back on old ground all are known ones, on new ground none: any number is as likely.
         costs = [each.cost + 2.0 * math.log(math.comb(m, len(each.chosen))) for each in found]
         return [
-            Twins(own[first[found[i].chosen]], own[second[found[i].chosen]], costs[i] - min(costs))
+            Twins(
+                own[first[found[i].chosen]],
+                own[second[found[i].chosen]],
+                costs[i] - min(costs),
+                search.seen_costs(found[i]),
+            )
             for i in np.argsort(costs, kind='stable')
             if costs[i] <= min(costs) + 2.0 * SURE
         ]

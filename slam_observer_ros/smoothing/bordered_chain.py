@@ -51,6 +51,7 @@ class ChainFactors:
 
     def __init__(self, equations: Equations) -> None:
         self._chain = _InNumpy(equations) if COMPILED is None else _Compiled(COMPILED, equations)
+        self._equations = equations
         # Symmetric: transposed it is laid out as LAPACK has it.
         self._corner, _ = cho_factor(self._chain.corner.T, lower=True, overwrite_a=True)
 
@@ -58,6 +59,11 @@ class ChainFactors:
         """Return the changes (S, d) of the poses and (b,) of the border."""
         border: FloatArray = -cho_solve((self._corner, True), self._chain.border_gradient)
         return self._chain.fill_in(border), border
+
+    def log_det(self) -> float:
+        """Return ln of the determinant of the whole matrix."""
+        of_chain = cholesky_banded(_band(self._equations))[-1]
+        return 2.0 * float(np.log(of_chain).sum() + np.log(np.diagonal(self._corner)).sum())
 
     def marginal(self) -> FloatArray:
         """Return the covariance (d + b, d + b) of the last pose and the border."""
@@ -118,14 +124,7 @@ class _InNumpy:
         rows[:c] += equations.shared.transpose(2, 0, 1)
         rows[:b, 0] += equations.first.T
         rows[b] = equations.gradient
-        # T in its upper banded form
-        band = np.zeros((2 * d, S, d))
-        for row in range(d):
-            for column in range(row, d):
-                band[2 * d - 1 + row - column, :, column] = equations.diagonal[:, row, column]
-            for column in range(d):
-                band[d - 1 + row - column, 1:, column] = equations.above[:, row, column]
-        self._factor = np.asfortranarray(cholesky_banded(band.reshape(2 * d, S * d)))
+        self._factor = np.asfortranarray(cholesky_banded(_band(equations)))
         solved = _forward(self._factor, rows.reshape(b + 1, S * d))
         self._border, self._gradient = solved[:b], solved[b]
         self.corner = equations.corner - self._border @ self._border.T  # (b, b) D − Bᵀ T⁻¹ B
@@ -140,6 +139,18 @@ class _InNumpy:
         right = self._gradient + border @ self._border
         changes: FloatArray = -dtbsv(bandwidth, self._factor, right)
         return changes.reshape(-1, self._d)
+
+
+def _band(equations: Equations) -> FloatArray:
+    """Return T in its upper banded form (2 d, S d)."""
+    S, d = equations.gradient.shape
+    band = np.zeros((2 * d, S, d))
+    for row in range(d):
+        for column in range(row, d):
+            band[2 * d - 1 + row - column, :, column] = equations.diagonal[:, row, column]
+        for column in range(d):
+            band[d - 1 + row - column, 1:, column] = equations.above[:, row, column]
+    return band.reshape(2 * d, S * d)
 
 
 def landmark_columns(landmarks: IntArray, c: int, k: int) -> IntArray:

@@ -126,10 +126,24 @@ class Smoother:
             start = step.end
         return step, min(cost, before)
 
+    def evidence(self, step: Step, cost: float) -> float:
+        """Return −2 ln of the likelihood of all that was seen, wherever it was seen from.
+
+        By Laplace, about what :meth:`descend` found: landmarks may be anywhere, one in each m^k.
+        As in :mod:`.joint_compatibility` the noise's own 1 / √|2π R| are left out.
+        """
+        known = np.linalg.slogdet(self._link_information)[1].sum()
+        known += np.linalg.slogdet(self._prior_information)[1]
+        known += self._axes.point * np.log(self._keyframes.shares).sum()
+        new = len(step.end.points) - len(self._prior.points)
+        free = self._axes.point * new * math.log(2.0 * math.pi)
+        return cost + step.factors.log_det() - float(known) - free
+
     def cost(self, solution: Solution) -> float:
         """Return −2 ln of the likelihood of all at a solution, but for a constant."""
-        self._complete(solution)
-        error = self._links(solution)[1]
+        if len(self._are_half):
+            self._complete(solution)
+        error = self._link_errors(solution)[0]
         cost = float(np.einsum('si,sij,sj->', error, self._link_information, error))
         at = solution.poses[0], solution.calibrations[0], solution.points, solution.orientations
         information, gradient = self._prior.normal_equations(
@@ -149,7 +163,7 @@ class Smoother:
 
     def motion_errors(self, solution: Solution) -> FloatArray:
         """Return by how much the motions are off (S, d), as right perturbations, rad and m."""
-        return self._links(solution)[1][:, : self._axes.p]
+        return self._link_errors(solution)[0][:, : self._axes.p]
 
     def ungated(self, start: Solution) -> Solution:
         """Return ``start``, if something is gated there after an iteration without the gate."""
@@ -302,29 +316,40 @@ class Smoother:
 
     def _links(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return derivatives of e_s (S, d) by poses and calibration; drift adds c_s − c_{s−1}."""
-        keyframes, pose = self._keyframes, self._axes.pose
-        # The motions, had they been computed with this calibration, and their errors.
-        links, eta = keyframes.links, np.zeros((len(keyframes.calibrations), 6))
-        off = solution.calibrations[:-1] - keyframes.calibrations
-        eta[:, pose] = (links.sensitivities @ off[:, :, None])[:, :, 0]
-        back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
-        motions = links.motions @ se3.exp(eta)
-        error = se3.log(se3.inverse(back @ motions))
+        keyframes = self._keyframes
+        error, twists, eta, back = self._link_errors(solution)
         # Derivatives by the pose after a motion, by that before, and by the calibration.
-        J_to = self._estimated(se3.left_jacobian_inverse(-error))
+        J_to = self._estimated(se3.left_jacobian_inverse(-twists))
         J_from = -J_to @ self._estimated(se3.adjoint(back))
-        F = links.sensitivities
+        F = keyframes.links.sensitivities
         if F.shape[2]:
-            J_off = -J_to @ self._estimated(se3.adjoint(back @ motions) @ se3.left_jacobian(-eta))
+            led = back @ (keyframes.links.motions @ se3.exp(eta))
+            J_off = -J_to @ self._estimated(se3.adjoint(led) @ se3.left_jacobian(-eta))
             F = J_off @ F
         if not self._chained:
-            return np.concatenate([J_from, J_to, F], axis=2), error[:, pose]
+            return np.concatenate([J_from, J_to, F], axis=2), error
         # (S, d + c, 2 d + 2 c), by both poses and their calibrations
-        drift, (d, c) = np.diff(solution.calibrations, axis=0), F.shape[1:]
+        d, c = F.shape[1:]
         J = np.zeros((len(F), d + c, 2 * (d + c)))
         J[:, :d, :d], J[:, :d, d : d + c], J[:, :d, d + c : -c] = J_from, F, J_to
         J[:, d:, d : d + c], J[:, d:, -c:] = -np.eye(c), np.eye(c)
-        return J, np.hstack([error[:, pose], drift])
+        return J, error
+
+    def _link_errors(
+        self, solution: Solution
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return e_s (S, d), its twists and F_s (c − c_s) (S, 6), and motions back (S, 4, 4)."""
+        # The motions, had they been computed with this calibration.
+        keyframes, links, pose = self._keyframes, self._keyframes.links, self._axes.pose
+        eta = np.zeros((len(keyframes.calibrations), 6))
+        off = solution.calibrations[:-1] - keyframes.calibrations
+        eta[:, pose] = (links.sensitivities @ off[:, :, None])[:, :, 0]
+        back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
+        twists = se3.log(se3.inverse(back @ (links.motions @ se3.exp(eta))))
+        error = twists[:, pose]
+        if self._chained:
+            error = np.hstack([error, np.diff(solution.calibrations, axis=0)])
+        return error, twists, eta, back
 
     def _estimated(self, matrices: FloatArray) -> FloatArray:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""

@@ -117,6 +117,9 @@ class NoPast:
     def placed(self, *_: object) -> None:
         """Return where a landmark is, which is not known."""
 
+    def evidence(self) -> None:
+        """Return how likely all that was seen is, which is not known."""
+
     def smooth(self) -> tuple[Step, int, History]:
         """Raise :exc:`ParameterError`, as no history is kept."""
         raise ParameterError(NO_HISTORY)
@@ -314,6 +317,25 @@ class Relinearisation:
         if were_summed_up and self.is_active:
             self.history.summarise(self._known().least_nonlinear(self._axes)[0])
             self._clear_counts()
+
+    def evidence(self) -> float | None:
+        """Return −2 ln of the likelihood of all that was seen, relinearised; None if unknown.
+
+        It is of all keyframes, where these are no more than are kept for landmarks that may enter.
+        """
+        history = self.history
+        is_short = 0 < len(history.stamps_ns) <= MOST_AWAITED
+        if not (self.is_active and self._errors.joint.is_dense and is_short) or self._axes.turn:
+            return None
+        try:
+            smoother = self._smoother(history.prior, history.keyframes().with_slips())
+            start = self._solution_from(0)
+            step, cost = smoother.descend(start, PLACING_ITERATIONS, COST_TOLERANCE)
+            evidence = smoother.evidence(step, cost)
+        except np.linalg.LinAlgError:
+            return None
+        history.poses[:] = list(step.end.poses)  # from where the next time begins
+        return evidence
 
     def smooth(self) -> tuple[Step, int, History]:
         """Return the last step of smoothing, how many slips it confirms, and what it is of.

@@ -59,6 +59,7 @@ class Assignment:
     rows: IntArray  # (m,) row of the landmark that each point is, −1 for a new one
     evidence: FloatArray  # (m,) that this landmark exists; 0 for a new one
     cost: float  # −2 ln of its likelihood; a part that all assignments share is left out
+    seen_costs: FloatArray  # (m,) the part of it that says where each landmark was seen
 
 
 def find_assignments(
@@ -85,7 +86,8 @@ def find_assignments(
     are_single, are_certain = len(within) == len(set(rows.tolist())) == len(at), certain.all()
     if is_alone and are_single and len(at) == m and are_certain:
         evidence = 0.5 * (none_costs[at] - huber_loss(np.sqrt(by_noise)))
-        return [Assignment(_taken(m, at, rows, -1), _taken(m, at, evidence, 0.0), 0.0)]
+        none = np.zeros(m)  # all hypotheses to come share it
+        return [Assignment(_taken(m, at, rows, -1), _taken(m, at, evidence, 0.0), 0.0, none)]
     PC, CPC = state.known_errors.predicted(residuals)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise, PC)
     # The cost of a point that is of no landmark.
@@ -113,11 +115,13 @@ def find_assignments(
     # By how much likelier each pair is than a point of nothing known.
     evidence = none_costs[at] - huber_loss(np.sqrt(squares)) - (log_dets - log_noise)
     evidence = np.maximum(0.5 * evidence, 0.0)
+    firsts = -np.linalg.slogdet(2.0 * np.pi * seen.noise[:, : axes.point, : axes.point])[1]
     return [
         Assignment(
             _taken(m, at[each.chosen], rows[each.chosen], -1),
             _taken(m, at[each.chosen], evidence[each.chosen], 0.0),
             each.cost + fixed_cost,
+            _taken(m, at[each.chosen], search.seen_costs(each), firsts),
         )
         for each in pairings
     ]
@@ -153,7 +157,7 @@ class _PoseMoves:
         return distinct
 
 
-def _taken(m: int, at: IntArray, values: Any, other: float) -> Any:
+def _taken(m: int, at: IntArray, values: Any, other: Any) -> Any:
     """Return values (m,) that are ``other`` but for the points ``at`` (q,)."""
     taken = np.full(m, other)
     taken[at] = values

@@ -34,6 +34,7 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import cholesky, mahalanobis, transpose
 from slam_observer_ros.models.velocity_delay import DelayEvidence
 from slam_observer_ros.models.velocity_history import VelocityHistory
+from slam_observer_ros.smoothing.relinearisation import MAX_TURN_RAD
 from slam_observer_ros.tracking.costs import NewLandmarks
 from slam_observer_ros.tracking.covariances import of_pose
 from slam_observer_ros.tracking.hypothesis import Branch, Hypothesis, Twins
@@ -211,14 +212,19 @@ class Hypotheses:
                     # Of three that are one, two at first; each per axis at the gate.
                     first = ~np.isin(way.rows, way.copies)
                     rows, copies = way.rows[first], way.copies[first]
+                    seen_cost, costs = one.state.landmarks.seen_cost, way.seen_costs[first]
+                    seen_cost[copies] += costs
                     fits = not len(rows) or one.state.merge(rows, copies, most) <= most
                     one.apart, one.cost = apart - own if fits else apart, one.cost + way.cost
-                    if fits and one is not hypothesis:
+                    if not fits:
+                        seen_cost[copies] -= costs
+                    elif one is not hypothesis:
                         followed.append(one)
                 if len(followed) > 1:
                     _part(followed, int(hypothesis.state.landmarks.last_seen_ns.max()))
                     self._all += followed[1:]
                 ways = find(hypothesis.state, hypothesis.apart)
+        _weigh_again(self._all)
         self._go_on_with(sorted(self._all, key=lambda one: one.cost)[: self._limit])
         least_cost = self._all[0].cost
         for hypothesis in self._all:
@@ -477,6 +483,9 @@ class Hypotheses:
         shown, children = self._all[0], list[_Child]()
         yield from self._follow(event, possible, children)
         children.sort(key=lambda child: child.hypothesis.cost)
+        if unknown and children[0].parent:  # another map would be shown
+            _weigh_again([child.hypothesis for child in children])
+            children.sort(key=lambda child: child.hypothesis.cost)
         self.update, least_cost = children[0].update, children[0].hypothesis.cost
         self._go_on_with([child.hypothesis for child in children])
         for hypothesis in self._all:
@@ -543,6 +552,8 @@ class Hypotheses:
             visibility, ids = hypothesis.visibility, taken.event.ids
             if taken.evidence is not None:
                 rows = state.landmarks.rows_of(ids)
+                if taken.seen_costs is not None:
+                    state.landmarks.seen_cost[rows[rows >= 0]] += taken.seen_costs[rows >= 0]
                 visibility.sure_now = state.landmarks.weigh(
                     rows[rows >= 0], taken.evidence[rows >= 0]
                 )
@@ -587,6 +598,24 @@ def _part(hypotheses: Iterable[Hypothesis], stamp_ns: int) -> None:
     for number, hypothesis in enumerate(hypotheses):
         position = hypothesis.state.observer.pose[:3, 3].copy()
         hypothesis.path = (*hypothesis.path, Branch(number, stamp_ns, position))
+
+
+def _weigh_again(hypotheses: Sequence[Hypothesis]) -> None:
+    """Let hypotheses cost what all that was seen costs by their own past, relinearised."""
+    # What a slip costs is set, and no likelihood.
+    if len(hypotheses) == 1 or len({one.state.counts['slip'] for one in hypotheses}) > 1:
+        return
+    of_poses = [one.state.known_errors.pose_covariance() for one in hypotheses]
+    if max(float(np.trace(each[:3, :3])) for each in of_poses) <= MAX_TURN_RAD**2:
+        return
+    evidence = [one.state.relinearisation.evidence() for one in hypotheses]
+    known = [each for each in evidence if each is not None]
+    if len(known) < len(hypotheses):
+        return
+    for one, each in zip(hypotheses, known, strict=True):
+        before = one.relinearised
+        one.relinearised = each - float(one.state.landmarks.seen_cost.sum())
+        one.cost += one.relinearised - before
 
 
 def _pairs(ids: IntArray, twins: Twins) -> frozenset[tuple[int, int]]:

@@ -177,6 +177,7 @@ class Twins:
     rows: IntArray  # (q,) those that were seen first …
     copies: IntArray  # (q,) … and those that they are, which go
     cost: float  # −2 ln of its likelihood over the likeliest answer's
+    seen_costs: FloatArray  # (q,) the part of it that says where each pair was seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +196,7 @@ class Hypothesis:
     state: State
     visibility: Visibility  # the view of a sensor that gives no ids
     cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
+    relinearised: float = 0.0  # what of that is by where landmarks were seen, relinearised
     apart: frozenset[tuple[int, int]] = frozenset()  # ids that are two landmarks in any case
     path: tuple[Branch, ...] = ()  # which way it went where others went another
 

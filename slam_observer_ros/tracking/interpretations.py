@@ -47,6 +47,8 @@ class Interpretation:
     given_ids: IntArray = field(default_factory=_none)
     # (m,) that each point's landmark exists; None if its id says so
     evidence: FloatArray | None = None
+    # (m,) the part of the cost that says where each landmark was seen
+    seen_costs: FloatArray | None = None
 
 
 def interpretations(
@@ -175,4 +177,5 @@ def _with_ids(
         named_rows=rows[is_named],
         given_ids=event.ids[is_named],
         evidence=assignment.evidence,
+        seen_costs=assignment.seen_costs,
     )

@@ -124,7 +124,8 @@ class JointSearch:
         # What the first point of no landmark costs less for that, the second one, ….
         self._steps = np.zeros(len(self._options)) if steps is None else steps
         # (q,) what the rise of the cost with a pair is less by
-        self._less = squares_and_log_dets(pairs.noise, pairs.residuals)[1] - pair_costs
+        self._pair_costs = pair_costs + np.zeros(len(pairs.points))
+        self._less = squares_and_log_dets(pairs.noise, pairs.residuals)[1] - self._pair_costs
         S, PC, r = pairs.covariances, pairs.with_pose, pairs.residuals.reshape(-1, 1)
         self._G = np.concatenate([S, r] if PC is None else [S, PC.T, r], axis=1)
 
@@ -139,6 +140,14 @@ class JointSearch:
         if (rises > self._unpaired_costs).any() or cost > self._budget:
             return None
         return Pairing(cost, chosen, W[:, :-1].T @ W[:, -1])
+
+    def seen_costs(self, pairing: Pairing) -> FloatArray:
+        """Return what of the cost says where its pairs (q,) are seen, as shares of one sum."""
+        chosen = set(pairing.chosen)
+        left = [own[0] for own in self._options.values() if chosen.isdisjoint(own)]
+        others = self._unpaired_costs[left].sum() + self._steps[: len(left)].sum()
+        others += self._pair_costs[pairing.chosen].sum()
+        return np.full(len(chosen), (pairing.cost - others) / max(len(chosen), 1))
 
     def pairings(self) -> list[Pairing]:
         """Return the pairings, the cheapest first; points without a landmark are in no pair."""

@@ -16,9 +16,14 @@ from slam_observer_ros.filter.landmark_table import ERROR, SURE
 from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.loop_closure import LoopClosure
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.tracking import hypotheses as hypotheses_module
+from slam_observer_ros.tracking import step as step_module
+from slam_observer_ros.tracking.costs import pairing_cost
 from slam_observer_ros.tracking.hypotheses import Hypotheses
+from slam_observer_ros.tracking.hypothesis import Hypothesis
+from slam_observer_ros.tracking.matching import match
 from slam_observer_ros.tracking.state import State
-from slam_observer_ros.tracking.step import step
+from slam_observer_ros.tracking.step import observe, step
 
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
 LOOP_NS = 100 * 10**9
@@ -195,6 +200,65 @@ def test_after_a_merger_all_that_was_seen_of_both_is_smoothed_as_of_one():
     smoothed, expected = estimator.smooth(), named.smooth()
     assert_allclose(smoothed.poses, expected.poses, atol=1e-3)
     assert_allclose(estimator.pose, named.pose, atol=0.02)
+
+
+def hypotheses_after_a_wrong_merger():
+    """Of two hypotheses the likelier one took two landmarks a metre apart or more for one."""
+    settings = replace(PLANAR, observation_correlation_time=0.0)
+    right = Hypothesis.of(gain_worlds.estimate(gain_worlds.drive(settings, 20.0), settings)._state)
+    wrong, hypotheses = right.copy(), Hypotheses(right.state)
+    wrong.state.merge(np.array([0]), np.array([1]), np.inf)
+    right.cost = 5.0
+    hypotheses._go_on_with([wrong, right])
+    return hypotheses, wrong, right
+
+
+@pytest.mark.parametrize('turn_rad', [0.0, 0.5])
+def test_a_merger_that_the_past_contradicts_is_undone_where_turns_may_be_large(
+    monkeypatch, turn_rad
+):
+    """Where the heading is known what the filter knew at each time is enough."""
+    monkeypatch.setattr(hypotheses_module, 'MAX_TURN_RAD', turn_rad)
+    hypotheses, wrong, right = hypotheses_after_a_wrong_merger()
+    hypotheses.fork(lambda *_: [])
+    assert hypotheses.best is (wrong if turn_rad else right).state
+
+
+def test_hypotheses_are_compared_by_their_past_where_all_of_them_have_one(monkeypatch):
+    """And where they slipped alike: what a slip costs is no likelihood."""
+    monkeypatch.setattr(hypotheses_module, 'MAX_TURN_RAD', 0.0)
+    hypotheses, wrong, right = hypotheses_after_a_wrong_merger()
+    right.state.forget_past('the pose was set')
+    hypotheses.fork(lambda *_: [])
+    assert hypotheses.best is wrong.state
+    hypotheses, wrong, right = hypotheses_after_a_wrong_merger()
+    right.state.counts['slip'] += 1
+    hypotheses.fork(lambda *_: [])
+    assert hypotheses.best is wrong.state
+
+
+def test_what_was_seen_is_as_likely_by_the_past_as_it_was_to_the_filter(monkeypatch):
+    settings = replace(PLANAR, observation_correlation_time=0.0, huber_threshold=0.0)
+    world, costs = gain_worlds.drive(settings, 12.0), []
+
+    def observed(one):
+        noise = one.state.observation_noise.covariances(one.event.select(one.rows < 0))[:, :2, :2]
+        first = -np.linalg.slogdet(2.0 * np.pi * noise)[1].sum()
+        known = match(one.state, one.event).residuals
+        costs.append(first + pairing_cost(one.state, len(known.rows), known))
+        return observe(one)
+
+    estimator = Estimator(settings)
+    for event in world.events[:-40]:
+        estimator.add(event)
+    estimator.flush()
+    before = estimator._state.relinearisation.evidence()
+    monkeypatch.setattr(step_module, 'observe', observed)
+    for event in world.events[-40:]:
+        estimator.add(event)
+    estimator.flush()
+    after = estimator._state.relinearisation.evidence()
+    assert_allclose(after - before, sum(costs), atol=1.0)
 
 
 def test_that_a_loop_has_closed_is_logged(caplog):

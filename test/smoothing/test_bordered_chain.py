@@ -36,3 +36,10 @@ def test_the_marginal_is_that_of_the_dense_inverse(S, landmarks):
     equations, H, _ = random_equations(S, landmarks)
     expected = np.linalg.inv(H)[(S - 1) * D :, (S - 1) * D :]
     np.testing.assert_allclose(ChainFactors(equations).marginal(), expected, rtol=1e-6, atol=1e-9)
+
+
+@chains
+@borders
+def test_the_determinant_is_that_of_the_dense_matrix(S, landmarks):
+    equations, H, _ = random_equations(S, landmarks)
+    np.testing.assert_allclose(ChainFactors(equations).log_det(), np.linalg.slogdet(H)[1])

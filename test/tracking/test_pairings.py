@@ -140,7 +140,8 @@ def test_a_slip_is_for_what_nothing_else_explains():
     state, ids = estimator._hypotheses.best, 100 + np.arange(4)
     unknown = np.full(4, UNKNOWN_ID)
     event = ObservationEvent(estimator.stamp_ns, unknown, points + [1.0, 0.0, 0.0])
-    costs, new = NewCosts(np.full(4, 20.0), np.zeros(4)), Assignment(unknown, np.zeros(4), 80.0)
+    costs, none = NewCosts(np.full(4, 20.0), np.zeros(4)), np.zeros(4)
+    new = Assignment(unknown, none, 80.0, none)
     (slip,) = _slips_without_ids(state, event, ids, costs, [new])
     assert slip.slipped is not None
     assert not _slips_without_ids(state, event, ids, costs, [])
