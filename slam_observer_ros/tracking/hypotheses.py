@@ -31,7 +31,7 @@ from slam_observer_ros.estimates import (
 )
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.lie import se3, so3
-from slam_observer_ros.lie.matrices import cholesky, mahalanobis, transpose
+from slam_observer_ros.lie.matrices import cholesky, mahalanobis, squares_and_log_dets, transpose
 from slam_observer_ros.models.velocity_delay import DelayEvidence
 from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.smoothing.relinearisation import MAX_TURN_RAD
@@ -102,19 +102,20 @@ class KnownMap:
         return self.state.observer.body_points(np.arange(len(self.state.landmarks)))
 
     @cached_property
-    def _whitening(self) -> FloatArray:
-        """W (n, k, k): what is off in the body frame is W times as many σ of a view."""
-        state, n, k = self.state, len(self.points), self.state.axes.point
+    def _covariances(self) -> FloatArray:
+        """(n, k, k) of a view of each, reference frame, m²."""
+        state, n = self.state, len(self.points)
         noise, joint = state.observation_noise.at(self.points), state.known_errors.joint
         rows = np.arange(n)
         residuals = state.gains.residuals(rows, self.points, noise, np.zeros(n), np.ones(n))
-        S = joint.output(joint.output_matrix(residuals), rows)[1] + residuals.on(state.axes)[1]
-        return np.asarray(np.linalg.inv(cholesky(S)) @ state.observer.A[:k, :k])
+        _, own = joint.output(joint.output_matrix(residuals), rows)
+        return own + residuals.on(state.axes)[1]
 
     def distances(self, rows: IntArray, other: KnownMap, others: IntArray) -> FloatArray:
         """Return how far from landmarks (m,) another state has its ``others``, in σ of a view."""
-        off = (other.points[others] - self.points[rows])[:, : self.state.axes.point, None]
-        return np.asarray(np.linalg.norm((self._whitening[rows] @ off)[..., 0], axis=1))
+        off = (other.points[others] - self.points[rows]).dot(self.state.observer.A[:3, :3].T)
+        S = self._covariances[rows]
+        return np.asarray(np.sqrt(squares_and_log_dets(S, off[:, : S.shape[2]])[0]))
 
 
 class Hypotheses:
@@ -672,7 +673,8 @@ def have_one_map(known: KnownMap, others_known: KnownMap, is_unlikely: bool = Fa
     more, others_more = known.sure - others_known.ids, others_known.sure - known.ids
     if (more or others_more) and not (is_unlikely and known.ids and others_known.ids):
         return False
-    return _agree(known, more, others_known) and _agree(others_known, others_more, known)
+    # The other one is compared more often, and has what it expects at hand.
+    return _agree(others_known, others_more, known) and _agree(known, more, others_known)
 
 
 def _agree(known: KnownMap, more: Set[int], others_known: KnownMap) -> bool:
