@@ -147,14 +147,14 @@ class _PoseMoves:
         """Return the first pairing of all that put the robot at one pose."""
         if len(pairings) < 2:
             return pairings
-        distinct: list[Pairing] = []
-        moves: list[FloatArray] = []
-        for pairing in pairings:
-            move = self.by(pairing)
-            if all(_largest(move - other) > RESOLUTION for other in moves):
-                distinct.append(pairing)
-                moves.append(move)
-        return distinct
+        moves = np.array([pairing.move for pairing in pairings]) @ self._J.swapaxes(1, 2)
+        off = moves[:, :, None] - moves[:, None]  # (m, b, b, k)
+        are_one = np.square(off).sum(axis=3).max(axis=0) <= RESOLUTION**2
+        kept = list[int]()
+        for i in range(len(pairings)):
+            if not are_one[i, kept].any():
+                kept.append(i)
+        return [pairings[i] for i in kept]
 
 
 def _taken(m: int, at: IntArray, values: Any, other: Any) -> Any:

@@ -169,8 +169,11 @@ def _with_ids(
     """Interpret m points as an assignment has them; ``new_ids`` (m,) are for new landmarks."""
     rows, has_id = assignment.rows, event.ids != UNKNOWN_ID
     known_ids = np.append(state.landmarks.ids, UNKNOWN_ID)[rows]
-    ids = np.where(has_id, event.ids, np.where(rows < 0, new_ids, known_ids))
-    is_named = has_id & (rows >= 0) & (known_ids != event.ids)
+    ids = np.where(rows < 0, new_ids, known_ids)
+    is_named = has_id
+    if has_id.any():
+        ids = np.where(has_id, event.ids, ids)
+        is_named = has_id & (rows >= 0) & (known_ids != event.ids)
     return Interpretation(
         replace(event, ids=ids),
         assignment.cost,
