@@ -106,10 +106,13 @@ class Smoother:
             start = step.end
         return step
 
-    def descend(self, start: Solution, iterations: int, tolerance: float) -> tuple[Step, float]:
+    def descend(
+        self, start: Solution, iterations: int, tolerance: float, slack: float = 0.0
+    ) -> tuple[Step, float]:
         """Return the last step, as :meth:`smooth`, and the cost at its end, which is the least.
 
-        A step that would go up is halved until it does not: so far from the end it is too long.
+        A step that would go up by more than ``slack`` is halved until it does not: so far from the
+        end it is too long.
         """
         cost = self.cost(start)  # which completes half points as well
         for _ in range(iterations):
@@ -118,7 +121,7 @@ class Smoother:
             before, cost = cost, math.inf
             for share in 0.5 ** np.arange(MOST_HALVED):
                 end = self._moved(start, share * change, share * border_change)
-                if (cost := self.cost(end)) < before:
+                if (cost := self.cost(end)) < before + slack:
                     break
             step = Step(start, end if cost < before else start, factors)
             if cost > before - tolerance:
@@ -146,10 +149,8 @@ class Smoother:
         error = self._link_errors(solution)[0]
         cost = float(np.einsum('si,sij,sj->', error, self._link_information, error))
         at = solution.poses[0], solution.calibrations[0], solution.points, solution.orientations
-        information, gradient = self._prior.normal_equations(
-            self._axes, self._prior_information, *at
-        )
-        cost += float(gradient @ np.linalg.lstsq(information, gradient)[0])
+        error = self._prior.errors(self._axes, *at)[0]
+        cost += float(error @ self._prior_information @ error)
         if (besides := self._prior.besides) is not None:
             values = solution.calibrations[0]
             cost += float(values @ (besides[0] @ values - 2.0 * besides[1]))

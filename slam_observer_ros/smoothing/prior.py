@@ -138,17 +138,11 @@ class Prior:
         calibration (c,), points (n + …, 3) and orientations (n + …, 3, 3).
         """
         d, k, first = axes.p, self._unknowns(axes), self._first_point(axes)
-        # The error of pose, calibration and landmarks, and its derivatives.
-        eta = se3.log(se3.inverse(self.pose) @ pose)
-        y = self._seen_from(pose, points[: len(self.points)])
-        shifts = (y - self._seen_from(self.pose, self.points))[:, : axes.point]
-        turns = self._turns_from(pose, orientations[: len(self.points)])
-        shifts = np.hstack([shifts, axes.turns(turns)])
+        error, eta, y, turns = self.errors(axes, pose, calibration, points, orientations)
+        # Its derivatives.
         J_turns = axes.turn_covariances(so3.left_jacobian_inverse(turns))
-        off = [eta[axes.pose], calibration - self.calibration, shifts.ravel()]
-        error = np.concatenate(off)
         J_eta = se3.left_jacobian_inverse(-eta)[axes.pose, axes.pose]
-        C, R = np.zeros((shifts.size, d)), np.eye(k)
+        C, R = np.zeros((len(error) - first, d)), np.eye(k)
         if self.is_relative:
             C, R = self._output_matrix(axes, y).reshape(-1, d), self._rotation(axes, pose)
 
@@ -164,6 +158,26 @@ class Prior:
 
         gradient = pull_back((information @ error)[:, None])[:, 0]
         return pull_back(pull_back(information).T), gradient
+
+    def errors(
+        self,
+        axes: EstimatedAxes,
+        pose: FloatArray,
+        calibration: FloatArray,
+        points: FloatArray,
+        orientations: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the error of pose, calibration and landmarks, and which of it is nonlinear.
+
+        That are the pose's twist (6,), and points as they are seen and their turns (n, 3).
+        """
+        eta = se3.log(se3.inverse(self.pose) @ pose)
+        y = self._seen_from(pose, points[: len(self.points)])
+        shifts = (y - self._seen_from(self.pose, self.points))[:, : axes.point]
+        turns = self._turns_from(pose, orientations[: len(self.points)])
+        shifts = np.hstack([shifts, axes.turns(turns)])
+        off = [eta[axes.pose], calibration - self.calibration, shifts.ravel()]
+        return np.concatenate(off), eta, y, turns
 
     def _seen_from(self, pose: FloatArray, points: FloatArray) -> FloatArray:
         """Return points (n, 3) in the frame in which they are known: a pose's or the world."""

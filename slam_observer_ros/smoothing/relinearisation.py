@@ -329,8 +329,9 @@ class Relinearisation:
             return None
         try:
             smoother = self._smoother(history.prior, history.keyframes().with_slips())
-            start = self._solution_from(0)
-            step, cost = smoother.descend(start, PLACING_ITERATIONS, COST_TOLERANCE)
+            step, cost = smoother.descend(
+                self._solution_from(0), PLACING_ITERATIONS, COST_TOLERANCE, COST_TOLERANCE
+            )
             evidence = smoother.evidence(step, cost)
         except np.linalg.LinAlgError:
             return None
