@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Set
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -16,9 +17,14 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
 from slam_observer_ros.filter.landmark_table import LandmarkTable, SURE
 from slam_observer_ros.filter.robust import accepted
-from slam_observer_ros.lie.matrices import mahalanobis
-from slam_observer_ros.tracking.hypothesis import Twins
-from slam_observer_ros.tracking.joint_compatibility import JointSearch, Pairs, PRUNING_COST_OF_IDS
+from slam_observer_ros.lie.matrices import diagonal_blocks, mahalanobis
+from slam_observer_ros.tracking.hypothesis import id_pairs, IdPairs, Twins
+from slam_observer_ros.tracking.joint_compatibility import (
+    columns_of,
+    JointSearch,
+    Pairs,
+    PRUNING_COST_OF_IDS,
+)
 from slam_observer_ros.tracking.state import State
 
 PERIOD_NS = 5_000_000_000  # time between two searches, nanoseconds
@@ -27,6 +33,10 @@ MAX_CANDIDATES = 10  # landmarks that another one may be: the likeliest, if ther
 # Standard deviation of how far apart they may be though exactly known, metres: no two views of a
 # thing have quite the same centre.
 LEAST_M = 0.01
+LATEST = 64  # landmarks, those seen last, of which it is asked: time grows with their cube
+# What odometry states of its standard deviation, then twice as much, and twice that, …
+WIDTHS = (1.0, 2.0, 4.0)
+FEW = 8  # of these that lie to each other as they were seen, however odometry was off
 NEIGHBOURS = 4  # landmarks next to one that say how many there are about it
 
 
@@ -45,10 +55,10 @@ class LoopClosure:
         rows = np.flatnonzero(landmarks.last_seen_ns == stamp_ns)
         if len(rows) < 2:
             return
-        points, ids = state.observer.points[rows], landmarks.ids[rows].tolist()
+        points = state.observer.points[rows]
         lengths_m = np.linalg.norm(points[:, None] - points, axis=2)
-        for i, j in zip(*np.nonzero(np.triu(lengths_m < self._near_m, 1)), strict=True):
-            self._apart[min(ids[i], ids[j]), max(ids[i], ids[j])] += 1
+        i, j = np.nonzero(np.triu(lengths_m < self._near_m, 1))
+        self._apart.update(id_pairs(landmarks.ids, rows[i], rows[j]))
 
     def is_due(self, state: State, stamp_ns: int) -> bool:
         """Return whether it is time to look for landmarks that are one."""
@@ -79,21 +89,19 @@ class LoopClosure:
         at, new = np.nonzero(is_since & (off_m < reach_m[:, None]))
         if not len(at):
             return
-        B = _blocks(state, np.concatenate([absent, added]))
-        r, new_at = points[absent[at]] - points[added[new]], len(absent) + new
-        differ = ~accepted(
-            mahalanobis(r, _of_differences(B, at, new_at, at, new_at)),
-            state.settings.rejection_threshold,
-        )
-        pairs = np.column_stack([landmarks.ids[absent[at]], landmarks.ids[added[new]]])[differ]
-        doubled = {(int(old), int(own)) for old, own in pairs} - self._doubled
+        old, own = absent[at], added[new]
+        B, a, b = _blocks(state, old, own)
+        distances = mahalanobis(points[old] - points[own], _of_differences(B, a, b, a, b))
+        differ = ~accepted(distances, state.settings.rejection_threshold)
+        doubled = {*id_pairs(landmarks.ids, old[differ], own[differ])} - self._doubled
         state.counts['doubled_landmark'] += len(doubled)
         self._doubled |= doubled
 
-    def twins(self, state: State, apart: Set[tuple[int, int]]) -> list[Twins]:
+    def twins(self, state: State, asked: Set[IdPairs]) -> list[Twins]:
         """Return which landmarks may be one: each likely answer, the likeliest first.
 
-        That none are is an answer, too. Ids ``apart`` are two landmarks.
+        That none are is an answer, too; others that were ``asked`` before are left out. It is
+        asked of the landmarks seen last.
         """
         rows, landmarks, k = state.confirmed, state.landmarks, state.axes.point
         own = rows[is_automatic(landmarks.ids[rows])]
@@ -101,61 +109,111 @@ class LoopClosure:
         if len(own) <= 2:
             return []
         points, gate = state.observer.points[own, :k], state.settings.rejection_threshold
-        lengths_m = np.linalg.norm(points[:, None] - points, axis=2)
+        last = np.sort(np.argsort(-landmarks.last_seen_ns[own], kind='stable')[:LATEST])
+        lengths_m = np.linalg.norm(points[last][:, None] - points, axis=2)
         # How many there are about each, but for a twin.
-        some = min(NEIGHBOURS, len(own) - 1)
-        radii_m = np.partition(lengths_m, some, axis=1)[:, some]
-        self._near_m = float(np.median(radii_m))
-        unit = math.pi if k == 2 else 4.0 / 3.0 * math.pi
-        log_densities = np.log(some / (unit * np.maximum(radii_m, LEAST_M) ** k))
-        # Pairs of an older and a later one that may be so near each other, …
-        B = _blocks(state, own)
-        shared = np.trace(B, axis1=2, axis2=3)
-        spread = np.add.outer(shared.diagonal(), shared.diagonal()) - 2.0 * shared
-        reach_m = gate * np.sqrt(np.maximum(spread, 0.0) + k * LEAST_M**2)
-        first, second = np.nonzero(np.triu(lengths_m <= reach_m, 1))
-        S = _of_differences(B, first, second, first, second)
-        distances = mahalanobis(points[first] - points[second], S)
-        order = np.lexsort((distances, second))
-        rank = np.arange(len(order)) - np.searchsorted(second[order], second[order])
-        near = np.sort(order[(rank < MAX_CANDIDATES) & accepted(distances[order], gate)])
-        first, second = first[near], second[near]
-        # … by how they were seen.
-        ids = np.sort(landmarks.ids[own][np.column_stack([first, second])], axis=1)
-        pairs = [(a, b) for a, b in ids.tolist()]
-        beside = np.array([self._apart[pair] for pair in pairs], dtype=np.int64)
-        evidence = _evidence(landmarks, own[first], own[second], beside)
-        may_be = np.array([pair not in apart for pair in pairs], dtype=np.bool_)
-        if not may_be.any():
+        nearest_m = np.sort(lengths_m, axis=1)[:, 1:]
+        m = min(NEIGHBOURS, len(own) - 2)
+        self._near_m = float(np.median(nearest_m[:, 0]))
+        log_densities = math.log(m / (math.pi if k == 2 else 4.0 / 3.0 * math.pi))
+        log_densities = log_densities - k * np.log(np.maximum(nearest_m[:, m], LEAST_M))
+        # Pairs that may be one, and how they were seen.
+        at, others, S = _pairs_near(state, own, last, lengths_m)
+        if not len(at):
             return []
-        first, second, evidence = first[may_be], second[may_be], evidence[may_be]
-        a, b = first[:, None], second[:, None]
-        S = _of_differences(B, a, b, first, second).swapaxes(1, 2).reshape((k * len(first),) * 2)
-        # Of second order, as the later ones lie turned to the others.
+        pairs = id_pairs(landmarks.ids, own[last[at]], own[others])
+        beside = np.array([self._apart[pair] for pair in pairs], dtype=np.int64)
+        are_new = np.array([frozenset([pair]) not in asked for pair in pairs], dtype=np.bool_)
+        evidence = _evidence(landmarks, own[others], own[last[at]], beside)
+        # How the last few lie turned and shifted, as a whole, to others that were not seen since:
+        # odometry alone lies between.
+        few = last[np.argsort(-landmarks.last_seen_ns[own[last]], kind='stable')[:FEW]]
+        older, newer = own[np.sort(np.stack([last[at], others]), axis=0)]
+        are_far = np.isin(last[at], few) != np.isin(others, few)
+        are_far &= landmarks.born_ns[newer] > landmarks.last_seen_ns[older]
+        arms = state.observer.points[own[last[at]]]
+        C = state.axes.output_matrix(arms - arms.mean(axis=0)).reshape(-1, state.axes.p)
+        C[np.repeat(~are_far, k)] = 0.0
+        whole = np.linalg.pinv(C)
+        whole = C @ (whole @ S @ whole.T) @ C.T
         turn = float(np.max(np.diagonal(state.known_errors.pose_covariance())[:3]))
-        off_m = np.linalg.norm(points[second] - points[second].mean(axis=0), axis=1)
-        S += np.diag(np.repeat(0.75 * (turn * off_m) ** 2, k))
-        r, unit_noise = points[first] - points[second], np.eye(k) / (2.0 * math.pi)
-        search = JointSearch(
-            Pairs(second, first, r, S, np.tile(unit_noise, (len(first), 1, 1))),
-            np.zeros(len(first), dtype=np.bool_),
-            -2.0 * log_densities[second],
-            PRUNING_COST_OF_IDS,
-            pair_costs=-2.0 * evidence,
-        )
-        found, m = search.pairings(), len(np.unique(second))
-        # Back on old ground all are known ones, on new ground none: any number is as likely.
-        costs = [each.cost + 2.0 * math.log(math.comb(m, len(each.chosen))) for each in found]
-        return [
-            Twins(
-                own[first[found[i].chosen]],
-                own[second[found[i].chosen]],
-                costs[i] - min(costs),
-                search.seen_costs(found[i]),
+        r, none = points[others] - points[last[at]], Twins(own[:0], own[:0], 0.0, np.empty(0))
+        found = [none]
+        for width in WIDTHS:
+            wide = S + (width**2 - 1.0) * whole
+            may_be = accepted(mahalanobis(r, diagonal_blocks(wide, k)), gate)
+            used = np.flatnonzero(may_be & (are_new if width == 1.0 else are_far))
+            columns, unit = columns_of(used.tolist(), k), np.eye(k) / (2.0 * math.pi)
+            wide, noise = wide[np.ix_(columns, columns)], np.tile(unit, (len(used), 1, 1))
+            # Of second order, as those seen last lie turned to the others.
+            of_used = points[last[at[used]]]
+            off_m = np.linalg.norm(of_used - of_used.sum(axis=0) / max(len(used), 1), axis=1)
+            wide += np.diag(np.repeat(0.75 * (width**2 * turn * off_m) ** 2, k))
+            search = JointSearch(
+                Pairs(at[used], others[used], r[used], wide, noise),
+                np.zeros(len(used), dtype=np.bool_),
+                -2.0 * log_densities[at[used]],
+                PRUNING_COST_OF_IDS,
+                pair_costs=-2.0 * evidence[used],
             )
-            for i in np.argsort(costs, kind='stable')
-            if costs[i] <= min(costs) + 2.0 * SURE
+            points_used = np.unique(at[used])
+            # Over none, of a factor of the variance as likely as MotionFactors have it at first.
+            extra = (2.0 * math.log(width)) ** 2 + 2.0 * float(log_densities[points_used].sum())
+            for each in search.pairings():
+                one, q = used[each.chosen], len(each.chosen)
+                # Some turn and shift fits so few pairs in any case.
+                if not q or (width > 1.0 and k * q <= state.axes.p):
+                    continue
+                # Back on old ground all are known, on new ground none: any number is as likely.
+                cost = each.cost + extra + 2.0 * math.log(math.comb(len(points_used), q))
+                first, second = np.sort(np.stack([last[at[one]], others[one]]), axis=0)
+                seen_costs = search.seen_costs(each)
+                found.append(Twins(own[first], own[second], cost, seen_costs, width))
+            found.sort(key=lambda one: one.cost)
+            if found[0].cost < -2.0 * SURE:
+                break
+        least = found[0].cost
+        return [
+            replace(one, cost=one.cost - least)
+            for one in found
+            if one.cost <= least + 2.0 * SURE and one.pairs(landmarks.ids) not in asked
         ]
+
+
+def _pairs_near(
+    state: State, own: IntArray, last: IntArray, lengths_m: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return pairs (q,), (q,) of one of ``last`` (l,) with one of ``own`` (n,) that may be it.
+
+    And the joint covariance (q k, q k) of how far apart they are, by odometry as it states its
+    noise. ``lengths_m`` (l, n) is how far apart they are, metres.
+    """
+    k, gate = state.axes.point, WIDTHS[-1] * state.settings.rejection_threshold
+    points, of_each = state.observer.points[own, :k], state.known_errors.landmark_covariances()
+    # By their own covariances at first: a difference has at most twice their sum.
+    of_each = of_each[own][:, :k, :k] + LEAST_M**2 * np.eye(k)
+    spread_m = np.sqrt(np.trace(of_each, axis1=1, axis2=2))
+    is_near = lengths_m <= gate * np.add.outer(spread_m[last], spread_m)
+    is_near[:, last] &= np.tri(len(last), k=-1, dtype=np.bool_)  # once, and none with itself
+    at, others = np.nonzero(is_near)
+    S = 2.0 * (of_each[last[at]] + of_each[others])
+    distances = mahalanobis(points[last[at]] - points[others], S)
+    near = _nearest(at, distances, 3 * MAX_CANDIDATES, gate)
+    at, others = at[near], others[near]
+    # Then by their joint one.
+    B, a, b = _blocks(state, own[last[at]], own[others])
+    distances = mahalanobis(points[last[at]] - points[others], _of_differences(B, a, b, a, b))
+    near = _nearest(at, distances, MAX_CANDIDATES, gate)
+    a, b = a[near], b[near]
+    S = _of_differences(B, a[:, None], b[:, None], a, b).swapaxes(1, 2)
+    return at[near], others[near], S.reshape((k * len(near),) * 2)
+
+
+def _nearest(at: IntArray, distances: FloatArray, most: int, gate: float) -> IntArray:
+    """Return which pairs (q,) of points ``at`` pass a gate, of each point the ``most`` nearest."""
+    order = np.lexsort((distances, at))
+    rank = np.arange(len(order)) - np.searchsorted(at[order], at[order])
+    return np.sort(order[(rank < most) & accepted(distances[order], gate)])
 
 
 def _evidence(
@@ -175,13 +233,20 @@ def _evidence(
     return np.asarray(np.log1p(q * alone) - beside * np.log1p(1.0 / expected))
 
 
-def _blocks(state: State, rows: IntArray) -> FloatArray:
-    """Return the joint covariance of landmarks (n,) in blocks (n, n, k, k)."""
-    P, k = state.gains.joint_covariance(rows), state.axes.point
+def _blocks(
+    state: State, rows: IntArray, others: IntArray
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return the joint covariance in blocks (m, m, k, k) of landmarks and others (q,).
+
+    And which of these m each landmark is, and each other one.
+    """
+    concerned, places = np.unique(np.append(rows, others), return_inverse=True)
+    P, k = state.gains.joint_covariance(concerned), state.axes.point
     if P is None:
         raise TypeError('a filter without a joint covariance has no twins')
-    p, n = state.axes.p, len(rows)
-    return np.asarray(P[p:, p:].reshape(n, k, n, k).swapaxes(1, 2))
+    p, m = state.axes.p, len(concerned)
+    a, b = np.split(places, 2)
+    return np.asarray(P[p:, p:].reshape(m, k, m, k).swapaxes(1, 2)), a, b
 
 
 def _of_differences(

@@ -37,7 +37,7 @@ from slam_observer_ros.models.velocity_history import VelocityHistory
 from slam_observer_ros.smoothing.relinearisation import MAX_TURN_RAD
 from slam_observer_ros.tracking.costs import NewLandmarks
 from slam_observer_ros.tracking.covariances import of_pose
-from slam_observer_ros.tracking.hypothesis import Branch, Hypothesis, Twins
+from slam_observer_ros.tracking.hypothesis import Branch, Hypothesis, IdPairs, Twins
 from slam_observer_ros.tracking.interpretations import (
     Interpretation,
     interpretations,
@@ -196,35 +196,35 @@ class Hypotheses:
         self._go_on_with(self._all[:1])
         return self.best
 
-    def fork(self, find: Callable[[State, Set[tuple[int, int]]], list[Twins]]) -> None:
+    def fork(self, find: Callable[[State, Set[IdPairs]], list[Twins]]) -> None:
         """Take landmarks for one that are likely to be; follow each answer that may be right.
 
-        ``find`` returns these of a state, but for pairs of ids that are two in any case.
+        ``find`` returns these of a state, but for those that were asked before.
         """
         for hypothesis in list(self._all):
-            most = hypothesis.state.settings.rejection_threshold**2 / hypothesis.state.axes.point
-            ways = find(hypothesis.state, hypothesis.apart)
+            gate = hypothesis.state.settings.rejection_threshold
+            ways = find(hypothesis.state, hypothesis.asked)
             while any(len(way.rows) for way in ways):
                 ids, followed = hypothesis.state.landmarks.ids, [hypothesis]
-                pairs = [_pairs(ids, way) for way in ways]
-                apart = hypothesis.apart.union(*pairs)
+                asked = hypothesis.asked.union(*(way.asked(ids) for way in ways))
                 others = [hypothesis.copy() for _ in ways[1:]]
-                for one, way, own in zip((hypothesis, *others), ways, pairs, strict=True):
+                for one, way in zip((hypothesis, *others), ways, strict=True):
                     # Of three that are one, two at first; each per axis at the gate.
-                    first = ~np.isin(way.rows, way.copies)
+                    first, one.asked = ~np.isin(way.rows, way.copies), asked
                     rows, copies = way.rows[first], way.copies[first]
+                    most = (way.width * gate) ** 2 / one.state.axes.point
                     seen_cost, costs = one.state.landmarks.seen_cost, way.seen_costs[first]
                     seen_cost[copies] += costs
-                    fits = not len(rows) or one.state.merge(rows, copies, most) <= most
-                    one.apart, one.cost = apart - own if fits else apart, one.cost + way.cost
-                    if not fits:
+                    if len(rows) and one.state.merge(rows, copies, most) > most:
                         seen_cost[copies] -= costs
-                    elif one is not hypothesis:
+                        continue
+                    one.cost += way.cost
+                    if one is not hypothesis:
                         followed.append(one)
                 if len(followed) > 1:
                     _part(followed, int(hypothesis.state.landmarks.last_seen_ns.max()))
                     self._all += followed[1:]
-                ways = find(hypothesis.state, hypothesis.apart)
+                ways = find(hypothesis.state, hypothesis.asked)
         _weigh_again(self._all)
         self._go_on_with(sorted(self._all, key=lambda one: one.cost)[: self._limit])
         least_cost = self._all[0].cost
@@ -617,12 +617,6 @@ def _weigh_again(hypotheses: Sequence[Hypothesis]) -> None:
         before = one.relinearised
         one.relinearised = each - float(one.state.landmarks.seen_cost.sum())
         one.cost += one.relinearised - before
-
-
-def _pairs(ids: IntArray, twins: Twins) -> frozenset[tuple[int, int]]:
-    """Return the ids of twins, the lower first."""
-    pairs = np.sort(np.column_stack([ids[twins.rows], ids[twins.copies]]), axis=1)
-    return frozenset((int(a), int(b)) for a, b in pairs)
 
 
 def _common(paths: Sequence[Sequence[Branch]]) -> list[Branch]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, replace
 import math
+from typing import TypeAlias
 
 import numpy as np
 
@@ -170,6 +171,9 @@ class Visibility:
         return is_unexpected
 
 
+IdPairs: TypeAlias = frozenset[tuple[int, int]]  # ids of landmarks that are one, the lower first
+
+
 @dataclass(frozen=True, slots=True)
 class Twins:
     """One answer to which landmarks are one: these."""
@@ -178,6 +182,22 @@ class Twins:
     copies: IntArray  # (q,) … and those that they are, which go
     cost: float  # −2 ln of its likelihood over the likeliest answer's
     seen_costs: FloatArray  # (q,) the part of it that says where each pair was seen
+    width: float = 1.0  # factor of what odometry states that it has been off by
+
+    def asked(self, ids: IntArray) -> frozenset[IdPairs]:
+        """Return what is not asked again: each pair, or all together where odometry is off."""
+        pairs = self.pairs(ids)
+        return frozenset([pairs] if self.width > 1.0 else [frozenset([one]) for one in pairs])
+
+    def pairs(self, ids: IntArray) -> IdPairs:
+        """Return it by the ids (n,) of all landmarks."""
+        return frozenset(id_pairs(ids, self.rows, self.copies))
+
+
+def id_pairs(ids: IntArray, rows: IntArray, others: IntArray) -> list[tuple[int, int]]:
+    """Return the ids of landmarks (q,) and of others (q,), pair by pair, the lower first."""
+    pairs = np.sort(np.column_stack([ids[rows], ids[others]]), axis=1).tolist()
+    return [(a, b) for a, b in pairs]
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +217,7 @@ class Hypothesis:
     visibility: Visibility  # the view of a sensor that gives no ids
     cost: float = 0.0  # −2 ln of its likelihood over the most likely one's
     relinearised: float = 0.0  # what of that is by where landmarks were seen, relinearised
-    apart: frozenset[tuple[int, int]] = frozenset()  # ids that are two landmarks in any case
+    asked: frozenset[IdPairs] = frozenset()  # pairs, and answers of several
     path: tuple[Branch, ...] = ()  # which way it went where others went another
 
     @classmethod
