@@ -434,10 +434,7 @@ class Estimator(Estimate):
         return bool(self._localiser.maps) or some_are_unknown or has_diverged
 
     def _judge_map(self, stamp_ns: int) -> None:
-        """Say that another map is shown from now on, and take landmarks for one that are."""
-        wrong = self.longest_ambiguity
-        if wrong is not None and wrong.until_ns == stamp_ns and self.ambiguity is None:
-            self._warnings.warn('ambiguous_map', '', **wrong.figures)
+        """Take landmarks for one that are, and say that another map is shown from now on."""
         closure = self._loop_closure
         closure.note(self._state, stamp_ns)
         if closure.is_due(self._state, stamp_ns):
@@ -448,6 +445,9 @@ class Estimator(Estimate):
                 if (merged := self.counts['merged_landmark'] - before) > 1:
                     logger.info('A loop has closed: %d landmarks were seen before.', merged)
             closure.count_doubled(self._state)
+        wrong = self.longest_ambiguity
+        if wrong is not None and wrong.until_ns == stamp_ns and self.ambiguity is None:
+            self._warnings.warn('ambiguous_map', '', **wrong.figures)
 
     def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""

@@ -201,6 +201,7 @@ class Hypotheses:
 
         ``find`` returns these of a state, but for those that were asked before.
         """
+        shown = self._all[0]
         for hypothesis in list(self._all):
             gate = hypothesis.state.settings.rejection_threshold
             ways = find(hypothesis.state, hypothesis.asked)
@@ -230,6 +231,9 @@ class Hypotheses:
         least_cost = self._all[0].cost
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
+        if self._all[0] is not shown:
+            stamp_ns = int(shown.state.landmarks.last_seen_ns.max(initial=0))
+            self._note_overthrow(shown, shown.path, stamp_ns)
 
     def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int

@@ -253,6 +253,7 @@ def hypotheses_after_a_wrong_merger():
     wrong, hypotheses = right.copy(), Hypotheses(right.state)
     wrong.state.merge(np.array([0]), np.array([1]), np.inf)
     right.cost = 5.0
+    hypotheses_module._part([wrong, right], gain_worlds.START_NS)
     hypotheses._go_on_with([wrong, right])
     return hypotheses, wrong, right
 
@@ -261,11 +262,12 @@ def hypotheses_after_a_wrong_merger():
 def test_a_merger_that_the_past_contradicts_is_undone_where_turns_may_be_large(
     monkeypatch, turn_rad
 ):
-    """Where the heading is known what the filter knew at each time is enough."""
+    """That is said. Where the heading is known what the filter knew at each time is enough."""
     monkeypatch.setattr(hypotheses_module, 'MAX_TURN_RAD', turn_rad)
     hypotheses, wrong, right = hypotheses_after_a_wrong_merger()
     hypotheses.fork(lambda *_: [])
     assert hypotheses.best is (wrong if turn_rad else right).state
+    assert (hypotheses.longest_ambiguity is None) == bool(turn_rad)
 
 
 def test_hypotheses_are_compared_by_their_past_where_all_of_them_have_one(monkeypatch):
