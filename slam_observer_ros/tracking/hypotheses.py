@@ -34,7 +34,7 @@ from slam_observer_ros.lie import se3, so3
 from slam_observer_ros.lie.matrices import cholesky, mahalanobis, squares_and_log_dets, transpose
 from slam_observer_ros.models.velocity_delay import DelayEvidence
 from slam_observer_ros.models.velocity_history import VelocityHistory
-from slam_observer_ros.smoothing.relinearisation import MAX_TURN_RAD
+from slam_observer_ros.smoothing.relinearisation import MAX_TURN_RAD, SHARE_OF_HISTORY
 from slam_observer_ros.tracking.costs import NewLandmarks
 from slam_observer_ros.tracking.covariances import of_pose
 from slam_observer_ros.tracking.hypothesis import Branch, Hypothesis, IdPairs, Twins
@@ -140,6 +140,8 @@ class Hypotheses:
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
+        # Observations so far, and how many at which hypotheses are weighed by their past again
+        self._observations, self._weighed_next = 0, 0.0
         self._new_landmarks = NewLandmarks()
         self.standing = Standing()  # whether wheels spin, and what the robot carries along
         self._views: MapViews | None = None  # where the robot is in a map
@@ -201,7 +203,7 @@ class Hypotheses:
 
         ``find`` returns these of a state, but for those that were asked before.
         """
-        shown = self._all[0]
+        before, shown = len(self._all), self._all[0]
         for hypothesis in list(self._all):
             gate = hypothesis.state.settings.rejection_threshold
             ways = find(hypothesis.state, hypothesis.asked)
@@ -226,7 +228,9 @@ class Hypotheses:
                     _part(followed, int(hypothesis.state.landmarks.last_seen_ns.max()))
                     self._all += followed[1:]
                 ways = find(hypothesis.state, hypothesis.asked)
-        _weigh_again(self._all)
+        if len(self._all) > before or self._observations >= self._weighed_next:
+            self._weighed_next = (1.0 + SHARE_OF_HISTORY) * self._observations
+            _weigh_again(self._all)
         self._go_on_with(sorted(self._all, key=lambda one: one.cost)[: self._limit])
         least_cost = self._all[0].cost
         for hypothesis in self._all:
@@ -468,6 +472,7 @@ class Hypotheses:
         """
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
+        self._observations += 1
         best = self.best
         some_may_be_named = best.landmarks.some_without_ids and may_name(best, event.ids)
         is_clear = len(self._all) == 1 and not unknown and not some_may_be_named
