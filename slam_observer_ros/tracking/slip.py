@@ -80,6 +80,9 @@ TOGETHER_NS = to_ns(0.25)
 At the start for half of that.
 """
 
+DROWNED = 1e-12
+"""Squared way, in standard deviations, below which covariances drown what is seen of it."""
+
 USUAL, FORGOTTEN = 4.0, 0.95
 """Standard deviations, in the mean, of ways by which it is quickly clear that landmarks pass; and
 the factor of the way that this takes, after each comparison: the noise may be less now.
@@ -445,7 +448,7 @@ class Standing:
             self._begin(look)
         else:
             shown, places = Shown(state, seen, velocities), self._are_places(state, seen.ids)
-            self._usual_m2 = way_m2 * USUAL**2 / float(np.mean(shown.way**2))
+            self._usual_m2 = way_m2 * USUAL**2 / max(float(np.mean(shown.way**2)), DROWNED)
             self._enough_m2 = 2.0 * way_m2
             for slip, slipped in enumerate(shown.slipped):
                 if shown.slips(slipped, places):
