@@ -83,10 +83,12 @@ class Errors:
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
-        r, R = residuals.on(self.axes)
+        return mahalanobis(residuals.on(self.axes)[0], self.own_innovation_covariances(residuals))
+
+    def own_innovation_covariances(self, residuals: Residuals) -> FloatArray:
+        """Return the covariance (m, k, k) of each residual alone, noise included."""
         C = self.joint.output_matrix(residuals, chord=0.5)
-        _, predicted = self.joint.output(C, residuals.rows)
-        return mahalanobis(r, predicted + R)
+        return self.joint.output(C, residuals.rows)[1] + residuals.on(self.axes)[1]
 
     def innovation_covariance(self, residuals: Residuals) -> FloatArray:
         """Return the joint covariance (m k, m k) of residuals, noise included."""

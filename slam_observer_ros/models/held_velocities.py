@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_observer_ros.common.stamps import NANOSECONDS_PER_SECOND, to_s
+from slam_observer_ros.common.stamps import to_ns, to_s
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
 LEAD_S = 0.5  # either side of it, a mean shows how fast the robot is in the middle
-LEAD_NS = round(LEAD_S * NANOSECONDS_PER_SECOND)
+LEAD_NS = to_ns(LEAD_S)
 
 
 class Velocities(NamedTuple):
@@ -97,17 +97,17 @@ def lead(velocities: Velocities, row: int, end_ns: int) -> tuple[FloatArray, Flo
     return to_s(np.diff(bounds_ns)), velocities.body_velocities[oldest : row + 1]
 
 
-def squared_speeds(held: HeldVelocities) -> FloatArray:
+def squared_speeds(motion: HeldVelocities) -> FloatArray:
     """Return squares (k, 6) of how fast the robot is in each of k pieces.
 
     One factor is the mean velocity over a window around the middle of the piece, as far as it is
     in the motion; the other one is the mean until the window's end over half a second at least,
     of which the noise in the first one is a small part.
     """
-    dt_s, b = np.append(held.lead_s, held.dt_s), len(held.lead_s)
+    dt_s, b = np.append(motion.lead_s, motion.dt_s), len(motion.lead_s)
     times_s = np.append(0.0, np.cumsum(dt_s))
     motions = np.zeros((len(times_s), 6))
-    V = np.concatenate([held.lead_velocities, held.body_velocities])
+    V = np.concatenate([motion.lead_velocities, motion.body_velocities])
     np.cumsum(dt_s[:, None] * V, axis=0, out=motions[1:])
     middles_s = 0.5 * (times_s[b:-1] + times_s[b + 1 :])
     numbers = np.arange(b, len(dt_s))

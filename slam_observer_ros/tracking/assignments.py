@@ -191,10 +191,9 @@ def _candidates(
     if seen.some_have_ids:
         allowed = _may_be(state, seen, at, rows)
         at, rows = at[allowed], rows[allowed]
-    residuals, joint = _as_residuals(state.observer, seen, at, rows), state.known_errors.joint
-    r, noise = residuals.on(state.axes)
-    _, own = joint.output(joint.output_matrix(residuals, chord=0.5), rows)
-    squares, log_dets = squares_and_log_dets(own + noise, r)
+    residuals = _as_residuals(state.observer, seen, at, rows)
+    S = state.known_errors.own_innovation_covariances(residuals)
+    squares, log_dets = squares_and_log_dets(S, residuals.on(state.axes)[0])
     near = accepted(np.sqrt(squares), state.settings.rejection_threshold)
     if np.count_nonzero(near) > MAX_CANDIDATES:  # a point keeps its nearest landmarks
         order = np.lexsort((squares, at))

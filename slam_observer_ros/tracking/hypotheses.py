@@ -105,11 +105,9 @@ class KnownMap:
     def _covariances(self) -> FloatArray:
         """(n, k, k) of a view of each, reference frame, m²."""
         state, n = self.state, len(self.points)
-        noise, joint = state.observation_noise.at(self.points), state.known_errors.joint
-        rows = np.arange(n)
+        noise, rows = state.observation_noise.at(self.points), np.arange(n)
         residuals = state.gains.residuals(rows, self.points, noise, np.zeros(n), np.ones(n))
-        _, own = joint.output(joint.output_matrix(residuals), rows)
-        return own + residuals.on(state.axes)[1]
+        return state.known_errors.own_innovation_covariances(residuals)
 
     def distances(self, rows: IntArray, other: KnownMap, others: IntArray) -> FloatArray:
         """Return how far from landmarks (m,) another state has its ``others``, in σ of a view."""
