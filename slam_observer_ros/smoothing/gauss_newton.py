@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -50,6 +51,16 @@ class Step:
 
 
 MOST_HALVED = 8  # times at most that a step is halved
+
+
+class _LinkErrors(NamedTuple):
+    """How far motions are off at a solution, and what their derivatives are made of."""
+
+    e: FloatArray  # (S, d)
+    twists: FloatArray  # (S, 6) ln of the motions that are left
+    eta: FloatArray  # (S, 6) F_s (c − c_s), by which calibration has changed the motions
+    back: FloatArray  # (S, 4, 4) from each pose to the one before
+    led: FloatArray  # (S, 4, 4) and on again by the motion
 
 
 class Smoother:
@@ -146,7 +157,7 @@ class Smoother:
         """Return −2 ln of the likelihood of all at a solution, but for a constant."""
         if len(self._are_half):
             self._complete(solution)
-        error = self._link_errors(solution)[0]
+        error = self._link_errors(solution).e
         cost = float(np.einsum('si,sij,sj->', error, self._link_information, error))
         at = solution.poses[0], solution.calibrations[0], solution.points, solution.orientations
         error = self._prior.errors(self._axes, *at)[0]
@@ -164,7 +175,7 @@ class Smoother:
 
     def motion_errors(self, solution: Solution) -> FloatArray:
         """Return by how much the motions are off (S, d), as right perturbations, rad and m."""
-        return self._link_errors(solution)[0][:, : self._axes.p]
+        return self._link_errors(solution).e[:, : self._axes.p]
 
     def ungated(self, start: Solution) -> Solution:
         """Return ``start``, if something is gated there after an iteration without the gate."""
@@ -317,14 +328,12 @@ class Smoother:
 
     def _links(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return derivatives of e_s (S, d) by poses and calibration; drift adds c_s − c_{s−1}."""
-        keyframes = self._keyframes
-        error, twists, eta, back = self._link_errors(solution)
+        error, twists, eta, back, led = self._link_errors(solution)
         # Derivatives by the pose after a motion, by that before, and by the calibration.
         J_to = self._estimated(se3.left_jacobian_inverse(-twists))
         J_from = -J_to @ self._estimated(se3.adjoint(back))
-        F = keyframes.links.sensitivities
+        F = self._keyframes.links.sensitivities
         if F.shape[2]:
-            led = back @ (keyframes.links.motions @ se3.exp(eta))
             J_off = -J_to @ self._estimated(se3.adjoint(led) @ se3.left_jacobian(-eta))
             F = J_off @ F
         if not self._chained:
@@ -336,21 +345,20 @@ class Smoother:
         J[:, d:, d : d + c], J[:, d:, -c:] = -np.eye(c), np.eye(c)
         return J, error
 
-    def _link_errors(
-        self, solution: Solution
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return e_s (S, d), its twists and F_s (c − c_s) (S, 6), and motions back (S, 4, 4)."""
+    def _link_errors(self, solution: Solution) -> _LinkErrors:
+        """Return how far motions are off, and what their derivatives are made of."""
         # The motions, had they been computed with this calibration.
         keyframes, links, pose = self._keyframes, self._keyframes.links, self._axes.pose
         eta = np.zeros((len(keyframes.calibrations), 6))
         off = solution.calibrations[:-1] - keyframes.calibrations
         eta[:, pose] = (links.sensitivities @ off[:, :, None])[:, :, 0]
         back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
-        twists = se3.log(se3.inverse(back @ (links.motions @ se3.exp(eta))))
+        led = back @ (links.motions @ se3.exp(eta))
+        twists = se3.log(se3.inverse(led))
         error = twists[:, pose]
         if self._chained:
             error = np.hstack([error, np.diff(solution.calibrations, axis=0)])
-        return error, twists, eta, back
+        return _LinkErrors(error, twists, eta, back, led)
 
     def _estimated(self, matrices: FloatArray) -> FloatArray:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""
