@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray, is_automatic
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray, is_automatic
 from slam_observer_ros.filter.landmark_table import LandmarkTable, SURE
 from slam_observer_ros.filter.robust import accepted
 from slam_observer_ros.lie.matrices import diagonal_blocks, mahalanobis
@@ -109,7 +109,8 @@ class LoopClosure:
         if len(own) <= 2:
             return []
         points, gate = state.observer.points[own, :k], state.settings.rejection_threshold
-        last = np.sort(np.argsort(-landmarks.last_seen_ns[own], kind='stable')[:LATEST])
+        latest = np.argsort(-landmarks.last_seen_ns[own], kind='stable')
+        last, few = np.sort(latest[:LATEST]), latest[:FEW]
         lengths_m = np.linalg.norm(points[last][:, None] - points, axis=2)
         # How many there are about each, but for a twin.
         nearest_m = np.sort(lengths_m, axis=1)[:, 1:]
@@ -127,15 +128,10 @@ class LoopClosure:
         evidence = _evidence(landmarks, own[others], own[last[at]], beside)
         # How the last few lie turned and shifted, as a whole, to others that were not seen since:
         # odometry alone lies between.
-        few = last[np.argsort(-landmarks.last_seen_ns[own[last]], kind='stable')[:FEW]]
         older, newer = own[np.sort(np.stack([last[at], others]), axis=0)]
         are_far = np.isin(last[at], few) != np.isin(others, few)
         are_far &= landmarks.born_ns[newer] > landmarks.last_seen_ns[older]
-        arms = state.observer.points[own[last[at]]]
-        C = state.axes.output_matrix(arms - arms.mean(axis=0)).reshape(-1, state.axes.p)
-        C[np.repeat(~are_far, k)] = 0.0
-        whole = np.linalg.pinv(C)
-        whole = C @ (whole @ S @ whole.T) @ C.T
+        whole = _as_a_whole(state, own[last[at]], are_far, S)
         turn = float(np.max(np.diagonal(state.known_errors.pose_covariance())[:3]))
         r, none = points[others] - points[last[at]], Twins(own[:0], own[:0], 0.0, np.empty(0))
         found = [none]
@@ -207,6 +203,18 @@ def _pairs_near(
     a, b = a[near], b[near]
     S = _of_differences(B, a[:, None], b[:, None], a, b).swapaxes(1, 2)
     return at[near], others[near], S.reshape((k * len(near),) * 2)
+
+
+def _as_a_whole(state: State, rows: IntArray, are_far: BoolArray, S: FloatArray) -> FloatArray:
+    """Return the part of S (q k, q k) in which landmarks (q,) lie turned and shifted together.
+
+    It is of pairs that ``are_far`` (q,), and zero elsewhere.
+    """
+    arms = state.observer.points[rows]
+    C = state.axes.output_matrix(arms - arms.mean(axis=0)).reshape(-1, state.axes.p)
+    C[np.repeat(~are_far, state.axes.point)] = 0.0
+    fit = np.linalg.pinv(C)
+    return np.asarray(C @ (fit @ S @ fit.T) @ C.T)
 
 
 def _nearest(at: IntArray, distances: FloatArray, most: int, gate: float) -> IntArray:
