@@ -16,7 +16,7 @@ from slam_observer_ros.lie import se3
 from slam_observer_ros.mapping.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.tracking.matching import match
-from slam_observer_ros.tracking.slip import slip
+from slam_observer_ros.tracking.slip import Shown, slip
 
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
 SPATIAL = Settings(reorder_window=0.0)
@@ -67,6 +67,20 @@ def test_a_slip_is_found_out_by_the_second_landmark_that_contradicts_odometry(se
     assert max(error_m for time_s, error_m in errors_m.items() if time_s > 50.0) < 0.25
     _, lost_m = run(world, replace(PLANAR, max_hypotheses=1))
     assert max(lost_m.values()) > 3.0
+
+
+def test_ways_that_covariances_drown_in_rounding_end_no_run(monkeypatch):
+    """As of a position that is known to 10⁸ m, beside points that are known to a millimetre."""
+
+    class Drowned(Shown):
+        def __init__(self, *args):
+            super().__init__(*args)
+            self.way = np.zeros(len(self.ids))
+
+    monkeypatch.setattr('slam_observer_ros.tracking.slip.Shown', Drowned)
+    world = gain_worlds.drive(PLANAR, 10.0, 0, noise=0.5)
+    estimator, _ = run(world, PLANAR)
+    assert estimator.counts['slip'] == 0
 
 
 @modes
