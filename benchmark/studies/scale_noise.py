@@ -75,7 +75,8 @@ def error_over_deviation(seed: int) -> FloatArray:
         outside = np.linalg.norm(pose[:2, 3]) > 0.4 * SIDE_M
         home = math.atan2(-pose[1, 3], -pose[0, 3]) - math.atan2(pose[1, 0], pose[0, 0])
         turn = np.clip(math.remainder(home, math.tau), -0.8, 0.8) if outside else goal[0]
-        moves = moves + np.clip([turn - moves[0], goal[1] - moves[1]], *_steps(dt_s))
+        most = ACCELERATIONS * dt_s
+        moves = moves + np.clip([turn - moves[0], goal[1] - moves[1]], -most, most)
         noisy = rng.normal(moves, np.hypot(DENSITY, noises * moves) / math.sqrt(dt_s))
         estimator.add(VelocityEvent(stamp_ns, _twist(noisy / (1.0 + off))))
         pose = pose @ se3.exp(dt_s * _twist(moves))
@@ -94,10 +95,6 @@ def error_over_deviation(seed: int) -> FloatArray:
     return np.array(
         [(one.value - 1.0 - k) / one.deviation for one, k in zip(scales, off, strict=True)]
     )
-
-
-def _steps(dt_s: float) -> tuple[FloatArray, FloatArray]:
-    return -ACCELERATIONS * dt_s, ACCELERATIONS * dt_s
 
 
 def _twist(moves: FloatArray) -> FloatArray:
